@@ -1,0 +1,40 @@
+"""Trajectory augmentation for off-policy evaluation, as a drop-in Minari dataset.
+
+>>> import oat_gym
+>>> data = oat_gym.AugmentedDataset("oat_gym/maze2d-umaze-v0", oat_gym.OAT(), factor=10, seed=0)
+>>> len(data)
+2500
+
+Importing the package teaches Minari the data format "oat" (see `oat_gym.dataset.install`).
+"""
+
+import importlib.metadata
+
+from oat_gym import domains, mining
+from oat_gym.augmenters import AUGMENTERS, Augmenter, Function
+from oat_gym.augmenters.oat import OAT
+from oat_gym.dataset import AugmentedDataset, augment, install
+from oat_gym.episodes import Transitions
+from oat_gym.mining import MiningConfig, MiningResult
+from oat_gym.provenance import Provenance
+from oat_gym.stitching import Span
+
+__version__ = importlib.metadata.version("oat-gym")
+
+install()
+
+__all__ = [
+    "AUGMENTERS",
+    "OAT",
+    "AugmentedDataset",
+    "Augmenter",
+    "Function",
+    "MiningConfig",
+    "MiningResult",
+    "Provenance",
+    "Span",
+    "Transitions",
+    "augment",
+    "domains",
+    "mining",
+]

@@ -1,0 +1,87 @@
+"""What an augmenter is: a frozen configuration that is fitted to a source and then makes variations of its episodes."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from minari import EpisodeData
+
+from oat_gym.cache import Arrays
+from oat_gym.episodes import IntArray
+from oat_gym.mining import MiningResult
+from oat_gym.progress import ProgressCallback, silent
+from oat_gym.source import Source
+from oat_gym.spaces import Batch
+from oat_gym.stitching import Span
+
+
+@dataclass(frozen=True)
+class Variation:
+    """One synthetic episode.
+
+    `episode` shares no memory with the source; `spans` are its generated steps; `next_states` holds the next states
+    that differ from `observations[t+1]` (the paper's literal seam), batches of one row keyed by step.
+    """
+
+    episode: EpisodeData
+    spans: tuple[Span, ...]
+    next_states: dict[int, Batch] = field(default_factory=dict[int, Batch])
+
+
+class Sampler(ABC):
+    """A fitted augmenter: variation k of source episode i, as a pure function of (seed, i, k).
+
+    The work is in two steps, so that the expensive one is done once and kept: `generate(k)` makes all that variation
+    k of any episode needs, in one batch, as arrays for the cache; `variation` puts one episode together from it.
+    """
+
+    @abstractmethod
+    def variation(self, i: int, k: int, material: Any) -> Variation:
+        """Return variation `k` of source episode `i`; `material` is what `decode` made of `generate(k)`."""
+
+    @property
+    def mining(self) -> MiningResult | None:
+        """What was mined, for methods that mine."""
+        return None
+
+    def generate(self, k: int) -> Arrays:
+        """Return the generated arrays of variation `k`; none by default (everything is made by `variation`)."""
+        return {}
+
+    def decode(self, arrays: Arrays) -> Any:
+        """Return the arrays of `generate` in the form that `variation` reads fastest; by default as they are."""
+        return arrays
+
+    def state(self) -> tuple[Arrays, Any]:
+        """Return (arrays, JSON value) from which `Augmenter.restore` makes an equal sampler; empty by default."""
+        return {}, None
+
+
+@dataclass(frozen=True)
+class Augmenter(ABC):
+    """Base of all augmenters: a frozen dataclass, so that its repr rebuilds it and its fields identify the cache."""
+
+    name: ClassVar[str]
+
+    @property
+    def cacheable(self) -> bool:
+        """Whether the fitted state is worth keeping on disk, and the settings have a JSON form to find it by."""
+        return True
+
+    @abstractmethod
+    def fit(self, source: Source, *, seed: int, progress: ProgressCallback = silent) -> Sampler:
+        """Learn from `source` and return the sampler of stream `seed`. Raises an `OatGymError` where it cannot work."""
+
+    def restore(self, source: Source, arrays: Arrays, value: Any, *, seed: int) -> Sampler:
+        """Return the sampler whose `state()` was (arrays, value); by default it is fitted anew."""
+        return self.fit(source, seed=seed)
+
+    def check(self, source: Source) -> None:  # noqa: B027  (most methods have no demand of their own)
+        """Raise an `OatGymError` where spaces or lengths rule the method out; reads no episode."""
+
+    def lengths(self, source_lengths: IntArray, episodes: IntArray, variations: IntArray, *, seed: int) -> IntArray:
+        """Return the number of steps of each variation (episodes[j], variations[j]), before anything is generated."""
+        return np.asarray(source_lengths)[episodes]

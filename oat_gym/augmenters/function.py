@@ -1,0 +1,73 @@
+"""Function: the user's own augmenter, any f(episode, rng) -> episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from minari import EpisodeData
+
+from oat_gym._rng import derive
+from oat_gym.augmenters.base import Augmenter, Sampler, Variation
+from oat_gym.episodes import check_episode, copy_episode
+from oat_gym.errors import ConfigurationError, InvalidDataError
+from oat_gym.progress import ProgressCallback, silent
+from oat_gym.source import Source
+from oat_gym.stitching import Span
+
+
+@dataclass(frozen=True)
+class Function(Augmenter):
+    """An augmenter from a function of an episode and a random generator.
+
+    `function(episode, rng)` gets a copy of a source episode (a `minari.EpisodeData`) and a `numpy.random.Generator`
+    that depends on the seed, the episode and the variation only. It returns an episode with as many steps; all its
+    steps count as generated. It may change the episode in place. Every space is accepted.
+
+    >>> def louder(episode, rng):
+    ...     episode.rewards[:] *= rng.uniform(0.9, 1.1)
+    ...     return episode
+    >>> Function(louder).name
+    'function'
+    """
+
+    name: ClassVar[str] = "function"
+    function: Callable[[EpisodeData, np.random.Generator], EpisodeData]
+
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            raise ConfigurationError(f"Function takes a callable f(episode, rng) -> episode, got {self.function!r}.")
+
+    @property
+    def cacheable(self) -> bool:
+        """False: a function has no fingerprint."""
+        return False
+
+    def fit(self, source: Source, *, seed: int, progress: ProgressCallback = silent) -> Sampler:
+        """Return a sampler that calls the function; nothing is learnt."""
+        return _FunctionSampler(self, source, seed)
+
+
+class _FunctionSampler(Sampler):
+    def __init__(self, augmenter: Function, source: Source, seed: int) -> None:
+        self._augmenter = augmenter
+        self._source = source
+        self._seed = seed
+
+    def variation(self, i: int, k: int, material: object) -> Variation:
+        original = self._source.episodes[i]
+        result = self._augmenter.function(copy_episode(original, number=i), derive(self._seed, "function", i, k))
+        if not isinstance(result, EpisodeData):
+            raise InvalidDataError(
+                f"The function given to Function returned {type(result).__name__} for episode {i}; it must return a "
+                "minari.EpisodeData."
+            )
+        check_episode(result, self._source.observation_space, self._source.action_space)
+        if len(result.rewards) != len(original.rewards):
+            raise InvalidDataError(
+                f"The function given to Function returned {len(result.rewards)} steps for episode {i} of "
+                f"{len(original.rewards)}; the length must stay, since it is announced before anything is generated."
+            )
+        return Variation(result, (Span(0, len(result.rewards)),))

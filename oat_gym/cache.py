@@ -1,0 +1,208 @@
+"""The cache on disk: fingerprints, checksummed single-file items written atomically, and one lock an entry.
+
+An *entry* is the folder of one fingerprint; an *item* is one safetensors file in it (arrays, and a JSON value in its
+header), sealed with a digest of all that it holds. An item is either absent or complete: it is written beside its
+place and moved there. Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import tempfile
+import warnings
+from collections.abc import Generator, Mapping
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import platformdirs
+from filelock import FileLock, Timeout
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from oat_gym.errors import CacheError
+
+FORMAT_VERSION = 1
+"""Part of every path and fingerprint: a newer library never reads, nor touches, an older one's entries."""
+
+Arrays = dict[str, npt.NDArray[Any]]
+
+_log = logging.getLogger(__name__)
+
+
+class CacheWarning(UserWarning):
+    """An item could not be kept on disk; the result in memory is complete, but will be made again next time."""
+
+
+def cache_folder() -> Path:
+    """Return the cache folder: `OAT_GYM_CACHE`, or the platform's cache folder for oat_gym."""
+    return Path(os.environ.get("OAT_GYM_CACHE") or platformdirs.user_cache_dir("oat_gym", appauthor=False))
+
+
+def canonical(value: object) -> Any:
+    """Return `value` as plain JSON data: dataclasses as their name and fields, tuples as lists, scalars as numbers.
+
+    Raises:
+        TypeError: if part of it has no JSON form.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        return {"class": type(value).__name__, **{key: canonical(part) for key, part in _fields(value).items()}}
+    if isinstance(value, Mapping):
+        return {str(key): canonical(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [canonical(part) for part in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"{value!r} of type {type(value).__name__} has no JSON form.")
+
+
+def fingerprint(**parts: object) -> str:
+    """Return the SHA-256, in hexadecimal, of the named parts and the cache's format version."""
+    text = json.dumps(canonical({"format": FORMAT_VERSION, **parts}), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+class CacheEntry:
+    """The items stored under one fingerprint.
+
+    >>> import tempfile
+    >>> entry = CacheEntry("ab12", folder=Path(tempfile.mkdtemp()))
+    >>> entry.write("model", {"weights": np.ones(2)}, {"epochs": 3})
+    True
+    >>> arrays, meta = entry.read("model")
+    >>> arrays["weights"].tolist(), meta
+    ([1.0, 1.0], {'epochs': 3})
+    """
+
+    def __init__(self, key: str, *, folder: Path | None = None) -> None:
+        self.key = key
+        self.path = (folder or cache_folder()) / f"v{FORMAT_VERSION}" / key[:2] / key
+
+    @contextlib.contextmanager
+    def lock(self) -> Generator[None]:
+        """Hold the entry's lock, which one process at a time has; others wait and say so in the log.
+
+        Where the folder cannot be written (a read-only disk) no lock is taken: nothing can be written either.
+        """
+        lock = FileLock(self.path.parent / f"{self.key}.lock")
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            try:
+                lock.acquire(timeout=0)
+            except Timeout:
+                _log.info("Waiting for another process that prepares the same data (%s).", self.path)
+                lock.acquire()
+        except OSError as error:
+            warnings.warn(f"No lock could be taken in the cache at {self.path}: {error}.", CacheWarning, stacklevel=3)
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def read(self, name: str) -> tuple[Arrays, Any] | None:
+        """Return (arrays, value) of an item, or None where it is absent or damaged (a damaged one is removed).
+
+        Raises:
+            CacheError: if the file is there and cannot be read.
+        """
+        path = self._item(name)
+        try:
+            return read_sealed(path)
+        except FileNotFoundError:
+            return None
+        except CacheError as error:
+            _log.warning("%s It is made again.", error)
+            path.unlink(missing_ok=True)
+            return None
+        except OSError as error:
+            raise CacheError(
+                f"The cache file {path} cannot be read ({error}). Make it readable, delete it, or name another folder "
+                "in OAT_GYM_CACHE."
+            ) from error
+
+    def write(self, name: str, arrays: Mapping[str, npt.NDArray[Any]], value: object) -> bool:
+        """Store an item atomically; return whether it could be. A full disk is a `CacheWarning`."""
+        path = self._item(name)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_sealed(path, arrays, value)
+        except OSError as error:
+            message = (
+                f"{name} could not be kept in the cache at {path.parent} ({error}): it will be made again next time."
+            )
+            warnings.warn(
+                f"{message} Free some space or name another folder in OAT_GYM_CACHE.", CacheWarning, stacklevel=3
+            )
+            return False
+        return True
+
+    def _item(self, name: str) -> Path:
+        return self.path / f"{name}.safetensors"
+
+
+def write_sealed(path: Path, arrays: Mapping[str, npt.NDArray[Any]], value: object) -> None:
+    """Write arrays and a JSON value to `path` as one safetensors file with a digest, atomically.
+
+    Raises:
+        OSError: if the disk refuses; `path` is then as it was before.
+    """
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    text = json.dumps(canonical(value), sort_keys=True)
+    header = {"value": text, "digest": _digest(contiguous, text), "format": str(FORMAT_VERSION)}
+    write_atomically(path, save(contiguous, metadata=header))
+
+
+def read_sealed(path: Path) -> tuple[Arrays, Any]:
+    """Return (arrays, value) of a file that `write_sealed` wrote.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        CacheError: if it is damaged: truncated, altered, or not of this format.
+    """
+    if not path.stat().st_size:
+        raise CacheError(f"{path} is damaged: it is empty.")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = file.metadata() or {}
+            arrays = {str(name): np.array(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise CacheError(f"{path} is damaged: {error}.") from error
+    text = header.get("value", "")
+    if header.get("digest") != _digest(arrays, text):
+        raise CacheError(f"{path} is damaged: its content does not match its digest.")
+    return arrays, json.loads(text)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Replace the file at `path` by one that holds `data`; a crash leaves the old file or the new one, whole."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _digest(arrays: Mapping[str, npt.NDArray[Any]], text: str) -> str:
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"|{name}|{array.dtype.str}|{array.shape}|".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    return {name: getattr(value, name) for name in asdict(value)}

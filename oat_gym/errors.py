@@ -1,0 +1,41 @@
+"""The exceptions that the package raises. Each is also the built-in error a caller would expect."""
+
+
+class OatGymError(Exception):
+    """Base of every error that oat_gym raises on purpose."""
+
+
+class ConfigurationError(OatGymError, ValueError):
+    """A setting has a value that cannot work; the message says what was got and what is expected."""
+
+
+class InvalidDataError(OatGymError, ValueError):
+    """The data breaks a rule of the method: NaN, an empty dataset, lengths that do not agree."""
+
+
+class UnsupportedSpaceError(OatGymError, TypeError):
+    """A Gymnasium space that the chosen method cannot model; the message names the space."""
+
+
+class TrainingError(OatGymError, RuntimeError):
+    """Training diverged; the message names the PST set. No data is produced."""
+
+
+class CacheError(OatGymError, RuntimeError):
+    """The cache on disk cannot be used and could not be rebuilt."""
+
+
+class DatasetExistsError(OatGymError, FileExistsError):
+    """A dataset of this id is already there; nothing was written."""
+
+
+class DatasetNotFoundError(OatGymError, FileNotFoundError):
+    """Data is not on this machine; the message says how to get it."""
+
+
+class SourceChangedError(OatGymError, RuntimeError):
+    """A recipe's source no longer has the content that it was made from."""
+
+
+class ConformanceError(OatGymError, AssertionError):
+    """A dataset, augmenter or estimator broke its contract (see `oat_gym.checks`)."""

@@ -1,0 +1,214 @@
+"""Saving: an augmented dataset as an ordinary Minari dataset, or as a recipe. Complete or absent, never between."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Generator, Iterable, Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from minari import EpisodeData
+from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_dataset import parse_dataset_id
+from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
+from minari.namespace import create_namespace, list_local_namespaces
+from minari.storage import get_dataset_path
+
+from oat_gym.cache import write_atomically
+from oat_gym.episodes import plain_infos
+from oat_gym.errors import ConfigurationError, DatasetExistsError
+from oat_gym.serialization import metadata_to_json
+from oat_gym.spaces import map_tree, tree_length
+
+DataFormat = Literal["hdf5", "arrow", "parquet"]
+DATA_FORMATS: tuple[DataFormat, ...] = ("hdf5", "arrow", "parquet")
+
+# Written by the storage itself, or true of the source only.
+_OWN_KEYS = {
+    "total_episodes",
+    "total_steps",
+    "dataset_size",
+    "data_format",
+    "jpeg_encoding",
+    "observation_space",
+    "action_space",
+    "env_spec",
+    "dataset_id",
+}
+
+
+def check_dataset_id(dataset_id: str) -> Path:
+    """Return the folder of a new dataset.
+
+    Raises:
+        ConfigurationError: if the id is not of Minari's form `namespace/name-v0`.
+        DatasetExistsError: if there is a dataset of this id.
+    """
+    try:
+        parse_dataset_id(dataset_id)
+    except (TypeError, ValueError) as error:
+        raise ConfigurationError(
+            f"{dataset_id!r} is no dataset id: expected (namespace/)name-v(version), for example 'door/human-oat-v0'."
+        ) from error
+    path = get_dataset_path(dataset_id)
+    if path.exists():
+        raise DatasetExistsError(
+            f"A dataset {dataset_id!r} is already at {path}; nothing was written. Choose another name or version, or "
+            f"remove it with `minari delete {dataset_id}`."
+        )
+    return path
+
+
+@contextlib.contextmanager
+def new_dataset_folder(dataset_id: str) -> Generator[Path]:
+    """Give the empty `data` folder of a new dataset; when the block ends well it moves to its place in one step.
+
+    The work is done in a hidden folder beside the datasets, which Minari does not list; it is removed when the block
+    fails, and a folder left by a killed process is removed by the next save.
+    """
+    path = check_dataset_id(dataset_id)
+    root = get_dataset_path()
+    _remove_leftovers(root)
+    staging = root / f".oat_gym-{os.getpid()}-{path.name}"
+    try:
+        (staging / "data").mkdir(parents=True)
+        yield staging / "data"
+        _make_namespace(dataset_id)
+        check_dataset_id(dataset_id)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        staging.rename(path)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def write_dataset(
+    data_path: Path,
+    dataset_id: str,
+    episodes: Iterable[tuple[EpisodeData, dict[str, Any]]],
+    *,
+    like: dict[str, Any],
+    spaces: tuple[Any, Any],
+    data_format: DataFormat,
+    step_mask: Callable[[dict[str, Any]], Any] | None = None,
+) -> None:
+    """Write episodes and their metadata as the dataset `dataset_id` into the empty folder `data_path`.
+
+    Args:
+        data_path: the dataset's `data` folder.
+        dataset_id: the id that the dataset will have.
+        episodes: (episode, metadata) in order.
+        like: raw metadata of a dataset whose author, scores, environment and so on the new one shares.
+        spaces: observation and action space.
+        data_format: one of `DATA_FORMATS`.
+        step_mask: gives, from an episode's metadata, T booleans to store as `infos["synthetic"]`; None stores none.
+    """
+    data_path.rmdir()
+    storage = MinariStorage.new(
+        data_path,
+        observation_space=spaces[0],
+        action_space=spaces[1],
+        data_format=data_format,
+        jpeg_encoding=False,  # what was iterated is what is stored, to the last bit
+    )
+    kept: list[dict[str, Any]] = []
+
+    def buffers() -> Iterator[EpisodeBuffer]:
+        for number, (episode, metadata) in enumerate(episodes):
+            kept.append(metadata)
+            mask = None if step_mask is None else step_mask(metadata)
+            yield _buffer(number, episode, mask, for_arrow=data_format != "hdf5")
+
+    with _size_known_later(storage):
+        storage.update_episodes(buffers())
+        storage.update_episode_metadata([_storable(metadata, data_format) for metadata in kept], range(len(kept)))
+    _write_common_metadata(data_path, dataset_id, like)
+    storage.update_metadata({"dataset_size": float(storage.get_size())})
+
+
+def _buffer(number: int, episode: EpisodeData, mask: Any, *, for_arrow: bool) -> EpisodeBuffer:
+    infos: dict[str, Any] | None = plain_infos(episode.infos)
+    if mask is not None:
+        # Infos have T+1 rows where the environment's reset gave one, else T: the mask takes the same form.
+        rows = max(tree_length(infos), len(mask)) if infos else len(mask)
+        infos = {**(infos or {}), "synthetic": np.concatenate([np.zeros(rows - len(mask), dtype=bool), mask])}
+    if infos and for_arrow:
+        infos = map_tree(lambda leaf: _arrow_info(leaf, len(episode.rewards)), infos)
+    return EpisodeBuffer(
+        id=number,
+        observations=episode.observations,
+        actions=episode.actions,
+        rewards=episode.rewards,  # pyright: ignore[reportArgumentType]  (Minari takes arrays as well as lists)
+        terminations=episode.terminations,  # pyright: ignore[reportArgumentType]
+        truncations=episode.truncations,  # pyright: ignore[reportArgumentType]
+        infos=infos,
+    )
+
+
+def _arrow_info(leaf: Any, length: int) -> Any:
+    """Return an info as Minari's arrow storage takes it: T+1 rows (the first one doubled), flat ones as a list.
+
+    Its writer refuses infos of T rows, and its reader fails on one-dimensional arrays.
+    """
+    if isinstance(leaf, np.ndarray):
+        leaf = np.concatenate([leaf[:1], leaf]) if len(leaf) == length else leaf
+        return list(leaf) if leaf.ndim == 1 else leaf
+    return [*leaf[:1], *leaf] if len(leaf) == length else leaf
+
+
+def _storable(metadata: dict[str, Any], data_format: str) -> dict[str, Any]:
+    metadata = {key: value for key, value in metadata.items() if key not in ("id", "total_steps") and value is not None}
+    return _flatten(metadata) if data_format == "hdf5" else metadata_to_json(metadata)
+
+
+def _flatten(metadata: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested metadata as HDF5 attributes: Minari joins the keys by a slash."""
+    flat: dict[str, Any] = {}
+    for key, value in metadata.items():
+        flat |= _flatten(value, f"{prefix}{key}/") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+def _write_common_metadata(data_path: Path, dataset_id: str, like: dict[str, Any]) -> None:
+    path = data_path / METADATA_FILE_NAME
+    metadata = json.loads(path.read_text())
+    metadata |= {key: value for key, value in like.items() if key not in _OWN_KEYS}
+    if "env_spec" in like:
+        metadata["env_spec"] = like["env_spec"]
+    write_atomically(path, json.dumps(metadata | {"dataset_id": dataset_id}).encode())
+
+
+@contextlib.contextmanager
+def _size_known_later(storage: MinariStorage) -> Generator[None]:
+    """Keep a storage from measuring its folder at each episode, which makes arrow exports quadratic."""
+    storage.get_size = lambda: 0.0
+    try:
+        yield
+    finally:
+        del storage.get_size
+
+
+def _make_namespace(dataset_id: str) -> None:
+    namespace = parse_dataset_id(dataset_id)[0]
+    if namespace is not None and namespace not in list_local_namespaces():
+        create_namespace(namespace)
+
+
+def _remove_leftovers(root: Path) -> None:
+    for folder in root.glob(".oat_gym-*"):
+        owner = folder.name.split("-")[1]
+        if owner.isdigit() and not _is_running(int(owner)):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

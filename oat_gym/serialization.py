@@ -1,0 +1,66 @@
+"""Configurations and metadata as plain JSON, and back; no code is ever read from a file."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from minari import MinariDataset
+from minari.dataset.minari_storage import MinariStorage
+from minari.serialization import serialize_space
+
+from oat_gym.errors import InvalidDataError
+
+
+def config_from_json(cls: type[Any], value: Mapping[str, Any]) -> Any:
+    """Return the frozen dataclass `cls` whose canonical JSON (`oat_gym.cache.canonical`) is `value`.
+
+    Nested dataclasses are those that the field's annotation names; lists become tuples.
+
+    Raises:
+        InvalidDataError: if `value` is not of this class or a field is missing, unknown or out of its range.
+    """
+    names = {field.name for field in dataclasses.fields(cls)}
+    if not isinstance(value, Mapping) or value.get("class") != cls.__name__ or set(value) - {"class"} != names:
+        raise InvalidDataError(f"Expected the settings of {cls.__name__} ({', '.join(sorted(names))}), got {value!r}.")
+    hints = typing.get_type_hints(cls)
+    try:
+        return cls(**{name: _field_from_json(hints[name], value[name]) for name in names})
+    except (TypeError, ValueError) as error:
+        raise InvalidDataError(f"The settings of {cls.__name__} cannot be read: {error}") from error
+
+
+def _field_from_json(hint: Any, value: Any) -> Any:
+    if isinstance(value, Mapping):
+        candidates = [hint, *typing.get_args(hint)]
+        for candidate in candidates:
+            if dataclasses.is_dataclass(candidate) and getattr(candidate, "__name__", "") == value.get("class"):
+                return config_from_json(typing.cast("type[Any]", candidate), value)
+        raise InvalidDataError(f"Unknown settings {value.get('class')!r} for a field of type {hint}.")
+    if isinstance(value, list):
+        return tuple(_field_from_json(Any, item) for item in value)
+    return value
+
+
+def metadata_to_json(value: Any) -> Any:
+    """Return episode metadata as JSON data: arrays as lists, NumPy scalars as numbers, nested dictionaries kept."""
+    if isinstance(value, Mapping):
+        return {str(key): metadata_to_json(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, list | tuple | set):
+        return [metadata_to_json(part) for part in value]
+    return value
+
+
+def source_metadata(dataset: MinariDataset) -> dict[str, Any]:
+    """Return the raw metadata of a dataset, its spaces written out (old datasets leave them to their environment)."""
+    metadata = MinariStorage.read_raw_metadata(dataset.storage.data_path)
+    metadata["observation_space"] = serialize_space(dataset.observation_space)
+    metadata["action_space"] = serialize_space(dataset.action_space)
+    return metadata

@@ -1,0 +1,315 @@
+"""AugmentedStorage: real, synthetic and appended episodes as one Minari storage of data format "oat".
+
+Episode ids are dense: 0..N-1 are the source's, N..N+count-1 the synthetic ones, those after them were appended by the
+user (`update_dataset_from_buffer`) and live in a Minari storage of our own beside `metadata.json`; the source is never
+written to. The directory is a temporary one until the dataset is saved as a recipe.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import os
+import pathlib
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from minari.data_collector import EpisodeBuffer
+from minari.dataset._storages import _registry  # pyright: ignore[reportPrivateUsage]
+from minari.dataset.minari_dataset import MinariDatasetSpec
+from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
+
+from oat_gym.augmenters.base import Variation
+from oat_gym.cache import write_atomically
+from oat_gym.episodes import copy_episode
+from oat_gym.errors import InvalidDataError, SourceChangedError
+from oat_gym.provenance import Provenance, merge_spans
+from oat_gym.recipe import LIVE_RECIPE, RECIPE_FILE, open_recipe
+from oat_gym.serialization import metadata_to_json, source_metadata
+from oat_gym.source import Source
+from oat_gym.synthesis import Synthesis
+
+DATA_FORMAT = "oat"
+APPENDED = "appended"
+EPISODE_METADATA_FILE = "episode_metadata.json"
+
+# Minari re-opens a dataset by its path (split_dataset, spec.data_path): within a process the same plan answers.
+_live: weakref.WeakValueDictionary[str, Synthesis] = weakref.WeakValueDictionary()
+
+
+class AugmentedStorage(MinariStorage):
+    """A Minari storage whose synthetic episodes are stitched from memory when they are read.
+
+    As a class its `FORMAT` is the registered "oat"; an instance tells the format of its source, in which Minari
+    writes what it derives from it (`combine_datasets`).
+    """
+
+    FORMAT = DATA_FORMAT
+
+    def __init__(
+        self,
+        data_path: pathlib.Path,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        jpeg_encoding: bool = True,
+    ) -> None:
+        super().__init__(pathlib.Path(data_path), observation_space, action_space, jpeg_encoding)
+        live = _live.get(str(data_path))
+        self.synthesis = live or open_recipe(self.data_path)
+        if self.synthesis is not None:
+            source_format = self.synthesis.source.dataset.storage.FORMAT
+            self.FORMAT = source_format  # pyright: ignore[reportConstantRedefinition]  (a class attribute in Minari)
+        appended = self.data_path / APPENDED
+        self._appended = MinariStorage.read(appended) if (appended / METADATA_FILE_NAME).exists() else None
+        if live is None and self.synthesis is not None:
+            self._check_totals(self.synthesis)
+
+    @classmethod
+    def of(cls, synthesis: Synthesis) -> AugmentedStorage:
+        """Return the storage of a new augmented dataset, in a temporary directory that goes with it."""
+        path = pathlib.Path(tempfile.mkdtemp(prefix="oat_gym-"))
+        write_metadata(path, synthesis)
+        write_atomically(path / RECIPE_FILE, json.dumps(LIVE_RECIPE).encode())
+        _attach(path, synthesis, owned=True)
+        source = synthesis.source
+        return cls(path, source.observation_space, source.action_space, source.dataset.storage.jpeg_encoding)
+
+    @classmethod
+    def _create(
+        cls,
+        data_path: pathlib.Path,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        jpeg_encoding: bool = True,
+    ) -> MinariStorage:
+        return cls(data_path, observation_space, action_space, jpeg_encoding)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle as the directory where that describes the dataset, else as the plan; never as open data."""
+        if self.synthesis is None or str(self.data_path) not in _live:
+            return MinariStorage.read, (str(self.data_path),)
+        plan = self.synthesis
+        return _reopen, (str(self.data_path), plan.source.dataset, plan.augmenter, plan.count, plan.seed)
+
+    @property
+    def n_real(self) -> int:
+        """Number of episodes of the source."""
+        return self.synthesis.n_real if self.synthesis else 0
+
+    @property
+    def n_planned(self) -> int:
+        """Number of real and synthetic episodes, without appended ones."""
+        return self.n_real + self.synthesis.count if self.synthesis else 0
+
+    def lengths(self, episode_indices: Iterable[int]) -> npt.NDArray[np.int64]:
+        """Return the steps of each episode; generates nothing."""
+        ids = np.asarray(list(episode_indices), dtype=np.int64)
+        out = np.zeros(len(ids), dtype=np.int64)
+        planned = ids < self.n_planned
+        if self.synthesis is not None:
+            out[planned] = self.synthesis.lengths[ids[planned]]
+        if self._appended is not None:
+            metadata = self._appended.get_episode_metadata(ids[~planned] - self.n_planned)
+            out[~planned] = [part["total_steps"] for part in metadata]
+        return out
+
+    def get_episodes(self, episode_indices: Iterable[int]) -> Iterator[dict[str, Any]]:
+        """Yield the data of the episodes, in the order asked for; synthetic ones are made now."""
+        total = self.total_episodes
+        for kind, run in itertools.groupby(episode_indices, key=lambda number: self._kind(number, total)):
+            if kind == "synthetic":
+                synthesis = self._plan()
+                for number in run:
+                    variation = synthesis.variation(int(number) - self.n_real)
+                    yield {**vars(variation.episode), "id": number}
+            elif kind == "real":
+                yield from self._real_episodes(list(run))
+            else:
+                yield from self._appended_episodes(list(run))
+
+    def variation(self, number: int) -> Variation | None:
+        """Return how the synthetic episode with id `number` was made; None for a real or an appended one."""
+        return self._plan().variation(number - self.n_real) if self.n_real <= number < self.n_planned else None
+
+    def provenance(self, number: int, variation: Variation | None = None) -> Provenance:
+        """Return where episode `number` comes from; fits first where it is synthetic and `variation` is not given."""
+        if number >= self.n_planned:
+            metadata = next(iter(self._appended_storage().get_episode_metadata([number - self.n_planned])))
+            return Provenance.from_metadata(metadata, number)
+        synthesis = self._plan()
+        if number < self.n_real:
+            return self._source_provenance(number)
+        j = number - self.n_real
+        i, k = j % self.n_real, j // self.n_real
+        new = variation or synthesis.variation(j)
+        spans = merge_spans(self._source_provenance(i).spans, new.spans)
+        return Provenance(True, i, k, spans, int(synthesis.lengths[number]))
+
+    def get_episode_metadata(self, episode_indices: Iterable[int]) -> Iterator[dict[str, Any]]:
+        """Yield the source's metadata of each episode with its provenance (see `Provenance.to_metadata`)."""
+        edits, total = self._edited_metadata(), self.total_episodes
+        for number in map(int, episode_indices):
+            if self._kind(number, total) == "appended":
+                local = number - self.n_planned
+                metadata = dict(next(iter(self._appended_storage().get_episode_metadata([local]))))
+            else:
+                source = number if number < self.n_real else (number - self.n_real) % self.n_real
+                metadata = dict(self._plan().source.metadata[source])
+                metadata |= self.provenance(number).to_metadata()
+                metadata["total_steps"] = int(self._plan().lengths[number])
+            yield metadata | {"id": number} | edits.get(str(number), {})
+
+    def update_episode_metadata(
+        self, metadatas: Iterable[dict[str, Any]], episode_indices: Iterable[int] | None = None
+    ) -> None:
+        """Add metadata to episodes; that of real and synthetic ones is kept beside them, not in the source."""
+        indices = list(range(self.total_episodes) if episode_indices is None else episode_indices)
+        updates = list(metadatas)
+        if len(indices) != len(updates):
+            raise ValueError("Metadatas and episode_indices have different lengths")
+        edits = self._edited_metadata()
+        for number, update in zip(map(int, indices), updates, strict=True):
+            edits[str(number)] = edits.get(str(number), {}) | metadata_to_json(update)
+        write_atomically(self.data_path / EPISODE_METADATA_FILE, json.dumps(edits).encode())
+        self.update_metadata({"dataset_size": self.get_size()})
+
+    def update_episodes(self, episodes: Iterable[EpisodeBuffer]) -> None:
+        """Append episodes (or steps to an appended one) to the side store.
+
+        Raises:
+            InvalidDataError: for a buffer whose id is that of a real or a synthetic episode, or leaves a gap.
+        """
+        storage = self._appended_storage()
+        for buffer in episodes:
+            local = None if buffer.id is None else buffer.id - self.n_planned
+            if local is not None and not 0 <= local <= storage.total_episodes:
+                raise InvalidDataError(
+                    f"Episode id {buffer.id} cannot be written: ids 0 to {self.n_planned - 1} are the source's and the "
+                    f"synthetic ones, and the next free id is {self.n_planned + storage.total_episodes}."
+                )
+            storage.update_episodes([dataclasses.replace(buffer, id=local)])
+        planned = int(self.synthesis.lengths.sum()) if self.synthesis else 0
+        totals = {
+            "total_episodes": self.n_planned + storage.total_episodes,
+            "total_steps": planned + storage.total_steps,
+        }
+        self.update_metadata({**totals, "dataset_size": self.get_size()})
+
+    def get_size(self) -> float:
+        """Return the size of the source and of our own files, in MB."""
+        source = self.synthesis.source.dataset.storage.get_size() if self.synthesis else 0.0
+        return float(np.round(source + super().get_size(), 1))
+
+    def _kind(self, number: int, total: int) -> str:
+        if not 0 <= number < total:
+            raise IndexError(f"There is no episode {number}: the dataset has {total} episodes, numbered from 0.")
+        if number < self.n_real:
+            return "real"
+        return "synthetic" if number < self.n_planned else "appended"
+
+    def _check_totals(self, synthesis: Synthesis) -> None:
+        appended = self._appended
+        episodes = self.n_planned + (appended.total_episodes if appended else 0)
+        claimed = (self.total_episodes, self.total_steps)
+        if claimed[0] == episodes:
+            steps = int(synthesis.lengths.sum()) + (appended.total_steps if appended else 0)
+            if claimed[1] == steps:
+                return
+        raise SourceChangedError(
+            f"The metadata at {self.data_path} says {claimed[0]} episodes and {claimed[1]} steps, which is not what "
+            f"its recipe and the source {synthesis.source.dataset.id!r} give. One of them was changed: save it again."
+        )
+
+    def _plan(self) -> Synthesis:
+        if self.synthesis is None:
+            raise InvalidDataError(f"The dataset at {self.data_path} has no source: all its episodes were appended.")
+        return self.synthesis
+
+    def _real_episodes(self, numbers: list[int]) -> Iterator[dict[str, Any]]:
+        source = self._plan().source
+        if source.is_loaded or source.expected_fingerprint:
+            yield from (vars(copy_episode(source.episodes[int(number)], number=number)) for number in numbers)
+            return
+        stored = source.dataset.storage.get_episodes(list(source.ids[numbers]))
+        for number, data in zip(numbers, stored, strict=True):
+            yield {**data, "id": number}
+
+    def _appended_episodes(self, numbers: list[int]) -> Iterator[dict[str, Any]]:
+        stored = self._appended_storage().get_episodes([number - self.n_planned for number in numbers])
+        for number, data in zip(numbers, stored, strict=True):
+            yield {**data, "id": number}
+
+    def _appended_storage(self) -> MinariStorage:
+        if self._appended is None:
+            formats = {DATA_FORMAT: "hdf5"}
+            self._appended = MinariStorage.new(
+                self.data_path / APPENDED,
+                observation_space=self.observation_space,
+                action_space=self.action_space,
+                data_format=formats.get(self.FORMAT, self.FORMAT),
+                jpeg_encoding=self.jpeg_encoding,
+            )
+        return self._appended
+
+    def _source_provenance(self, number: int) -> Provenance:
+        source = self._plan().source
+        inherited = Provenance.from_metadata(source.metadata[number], number)
+        position = np.flatnonzero(source.ids == inherited.source) if inherited.synthetic else [number]
+        return dataclasses.replace(inherited, source=int(position[0]) if len(position) else -1)
+
+    def _edited_metadata(self) -> dict[str, dict[str, Any]]:
+        path = self.data_path / EPISODE_METADATA_FILE
+        return json.loads(path.read_text()) if path.exists() else {}
+
+
+def register() -> None:
+    """Make "oat" one of Minari's data formats, for every function of Minari that opens a dataset."""
+    _registry[DATA_FORMAT] = lambda: AugmentedStorage
+
+
+def write_metadata(
+    path: pathlib.Path,
+    synthesis: Synthesis,
+    *,
+    dataset_id: str | None = None,
+    totals: MinariDatasetSpec | None = None,
+) -> None:
+    """Write `metadata.json` of an augmented dataset: the source's keys, with an id, totals and a format of its own."""
+    dataset = synthesis.source.dataset
+    metadata = source_metadata(dataset) | {
+        "total_episodes": totals.total_episodes if totals else synthesis.n_real + synthesis.count,
+        "total_steps": totals.total_steps if totals else int(synthesis.lengths.sum()),
+        "data_format": DATA_FORMAT,
+        "dataset_id": dataset_id or dataset.id,
+        "dataset_size": dataset.storage.get_size(),
+    }
+    write_atomically(path / METADATA_FILE_NAME, json.dumps(metadata).encode())
+
+
+def _attach(path: pathlib.Path, synthesis: Synthesis, *, owned: bool) -> None:
+    _live[str(path)] = synthesis
+    if owned:
+        weakref.finalize(synthesis, _remove, str(path), os.getpid())
+
+
+def _remove(path: str, pid: int) -> None:
+    if os.getpid() == pid:  # a forked worker must not take its parent's directory away
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _reopen(path: str, *plan: Any) -> MinariStorage:
+    if path in _live:
+        return MinariStorage.read(path)
+    dataset, augmenter, count, seed = plan
+    synthesis = Synthesis(Source(dataset), augmenter, count=count, seed=seed)
+    if not pathlib.Path(path).exists():
+        return AugmentedStorage.of(synthesis)
+    _attach(pathlib.Path(path), synthesis, owned=False)
+    return MinariStorage.read(path)

@@ -1,0 +1,81 @@
+"""Loading by name, where data is looked for, and what is said when it is not there."""
+
+import doctest
+from pathlib import Path
+
+import minari
+import pytest
+
+from oat_gym import domains
+from oat_gym.domains import _data, adroit, maze2d, tutoring
+from oat_gym.errors import DatasetNotFoundError, OatGymError
+
+
+def test_an_unknown_name_is_refused_with_the_names():
+    with pytest.raises(OatGymError, match=r"no dataset named 'maze'.*adroit-door-human, maze2d-umaze, tutoring"):
+        domains.load("maze")
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("adroit-door-human", "minari download D4RL/door/human-v2"), ("tutoring-smartprimer", "SmartPrimer_Gym")],
+)
+def test_missing_data_says_how_to_get_it(name: str, hint: str, tmp_path, monkeypatch):
+    monkeypatch.setenv("OAT_GYM_DATA", str(tmp_path))
+    with pytest.raises(DatasetNotFoundError, match=hint) as caught:
+        domains.load(name)
+    assert "OAT_GYM_DATA" in str(caught.value)
+    assert isinstance(caught.value, FileNotFoundError)
+
+
+def test_a_wrong_data_folder_is_an_error(monkeypatch, tmp_path):
+    monkeypatch.setenv("OAT_GYM_DATA", str(tmp_path / "absent"))
+    with pytest.raises(DatasetNotFoundError, match=r"OAT_GYM_DATA=.*absent is not a folder"):
+        domains.load("tutoring-smartprimer")
+
+
+def test_a_file_is_found_in_each_layout(tmp_path, monkeypatch):
+    nested = tmp_path / "data" / "tutoring" / "log.csv"
+    nested.parent.mkdir(parents=True)
+    nested.write_text("x")
+    monkeypatch.setenv("OAT_GYM_DATA", str(tmp_path / "data"))
+    for path in (None, nested, nested.parent, tmp_path / "data", str(nested)):
+        assert _data.find_file("tutoring/log.csv", path=path, how_to_get="") == nested
+    with pytest.raises(DatasetNotFoundError, match=r"log.csv was not found \(looked in .*elsewhere\)\. Ask\."):
+        _data.find_file("tutoring/log.csv", path=tmp_path / "elsewhere", how_to_get="Ask.")
+
+
+def test_minaris_own_copy_of_the_demonstrations_is_preferred(tmp_path, monkeypatch):
+    marker = object()
+    monkeypatch.setattr(minari, "list_local_datasets", lambda: {"D4RL/door/human-v2": {}})
+    monkeypatch.setattr(minari, "load_dataset", lambda name: (name, marker))
+    assert adroit.door_human() == ("D4RL/door/human-v2", marker)
+    with pytest.raises(DatasetNotFoundError):
+        adroit.door_human(path=tmp_path)
+
+
+@pytest.mark.parametrize("module", [domains, maze2d, adroit, tutoring])
+def test_examples_in_docstrings(module):
+    assert doctest.testmod(module).failed == 0
+
+
+def test_conversion_happens_once_and_follows_the_source(tmp_path, monkeypatch):
+    monkeypatch.setenv("OAT_GYM_CACHE", str(tmp_path / "cache"))
+    calls: list[Path] = []
+
+    def write(folder: Path) -> minari.MinariDataset:
+        calls.append(folder)
+        (folder / "data").parent.mkdir(parents=True)
+        return marker
+
+    marker = maze2d.umaze()
+    monkeypatch.setattr(minari, "MinariDataset", lambda path: path)
+    source = tmp_path / "source"
+    source.write_text("one")
+    assert _data.converted("x", source, version=1, write=write) is marker
+    assert _data.converted("x", source, version=1, write=write) == calls[0] / "data"
+    _data.converted("x", source, version=2, write=write)
+    source.write_text("two")
+    _data.converted("x", source, version=1, write=write)
+    assert len(calls) == len(set(calls)) == 3
+    assert all(folder.is_relative_to(tmp_path / "cache") for folder in calls)
