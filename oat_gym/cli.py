@@ -32,6 +32,11 @@ app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_comp
 out = Console(highlight=False, soft_wrap=True)
 
 DEMO_ID = "maze2d-umaze/oat-v0"
+DEMO_CONFIG = OAT(
+    mining=MiningConfig(n_clusters="auto", candidates=tuple(range(4, 11)), switch_penalty=20.0, top=3),
+    features=("achieved_goal",),
+)
+"""Three PST sets, as in the paper's Fig. 4, of clusters of places in the maze."""
 
 Dataset = Annotated[str, typer.Argument(help="Id of a local Minari dataset, or a name of oat_gym.domains.DATASETS.")]
 Method = Annotated[str, typer.Option("--augmenter", help=f"One of {', '.join(AUGMENTERS)}.")]
@@ -78,9 +83,8 @@ def demo(
 
     Everything is written to one folder; run it again and it is read from the cache.
     """
-    os.environ["MINARI_DATASETS_PATH"] = str(folder / "datasets")
-    config = OAT(mining=MiningConfig(n_clusters="auto", top=3), features=("observation",))
-    data = AugmentedDataset(maze2d.umaze(), config, factor=factor, seed=seed)
+    os.environ["MINARI_DATASETS_PATH"] = str((folder / "datasets").resolve())
+    data = AugmentedDataset(maze2d.umaze(), DEMO_CONFIG, factor=factor, seed=seed)
     with progress_bar() as progress:
         data.fit(progress=progress)
         _save_demo(data)

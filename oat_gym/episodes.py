@@ -162,7 +162,7 @@ def content_hash(episodes: Iterable[EpisodeData]) -> str:
 
 
 def _hash_tree(digest: Any, batch: Batch) -> None:
-    if not batch and isinstance(batch, dict | None):  # no infos: None in one storage format, {} in another
+    if batch is None or (isinstance(batch, dict) and not batch):  # no infos: None in one storage format, {} in another
         digest.update(b"{}")
     elif isinstance(batch, dict):
         for key in sorted(batch):

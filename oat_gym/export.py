@@ -70,8 +70,8 @@ def new_dataset_folder(dataset_id: str) -> Generator[Path]:
     The work is done in a hidden folder beside the datasets, which Minari does not list; it is removed when the block
     fails, and a folder left by a killed process is removed by the next save.
     """
-    path = check_dataset_id(dataset_id)
-    root = get_dataset_path()
+    path = check_dataset_id(dataset_id).resolve()
+    root = get_dataset_path().resolve()  # Minari cannot measure a folder by a relative path
     _remove_leftovers(root)
     staging = root / f".oat_gym-{os.getpid()}-{path.name}"
     try:

@@ -53,7 +53,8 @@ def value_coded_buffer(episode: int, length: int, *, terminates: bool = False) -
         rewards=values[:-1],
         terminations=last & terminates,
         truncations=last & (not terminates),
-        infos={"clock": values.astype(np.float64), "nested": {"twice": np.stack([values, values], axis=1)}},
+        # a list: Minari's arrow storage cannot read back an info that was written as a one-dimensional array
+        infos={"clock": list(values), "nested": {"twice": np.stack([values, values], axis=1)}},
     )
 
 

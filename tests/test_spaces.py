@@ -76,7 +76,7 @@ def _one(space: spaces.Space, batch: object) -> object:
         return {key: _one(child, batch[key]) for key, child in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
         return tuple(_one(child, part) for child, part in zip(space.spaces, batch, strict=True))
-    return batch[0]
+    return np.asarray(batch[0])
 
 
 @given(SPACES)

@@ -13,6 +13,7 @@ class BestTracker:
 
     A stopped member's weights and history do not change any more, whatever the others do. With `patience=None`
     nobody stops, and the last weights are kept. A member whose score is not finite has diverged and stops for good.
+    Patience runs from update `start` on.
 
     Attributes:
         score: (K,) score of the kept weights.
@@ -20,8 +21,8 @@ class BestTracker:
         finite: (K,) whether the last score looked at was finite.
     """
 
-    def __init__(self, members: int, *, patience: int | None) -> None:
-        self._patience = patience
+    def __init__(self, members: int, *, patience: int | None, start: int = 0) -> None:
+        self._patience, self._start = patience, start
         self.score = torch.full((members,), -torch.inf)
         self.finite = torch.ones(members, dtype=torch.bool)
         self.weights = torch.empty(0)
@@ -48,7 +49,7 @@ class BestTracker:
         self._best_update = torch.where(better, update, self._best_update)
         self._active &= finite
         if self._patience is not None:
-            self._active &= update - self._best_update < self._patience
+            self._active &= update - self._best_update.clamp(min=self._start) < self._patience
 
     def history(
         self, member: int, *, held_out: bool

@@ -193,24 +193,37 @@ def fit_behavior(
     _check(states, actions, ids, state_layout, action_layout)
     held = hold_out(ids, share=config.validation, rng=rng, name="The behaviour data")
     generator = torch_generator(rng)
+    model = _untrained(states, actions, state_layout=state_layout, action_layout=action_layout, config=config)
+    model = replace(model, bounds=None if bounds is None else (bounds[0].copy(), bounds[1].copy()))
     shapes = _shapes(state_layout, action_layout, config)
-    blank = BehaviorModel(
+    with one_thread():
+        flat = initial_weights(shapes, generator)[None].to(config.device)
+        tracker = _train(model, flat, states, actions, held=held, rng=rng, progress=progress)
+    weights = {name: weight.clone() for name, weight in unpack(tracker.weights, shapes).items()}
+    score = float(tracker.score[0]) if held.any() else np.nan
+    _logger.info("Behaviour policy: log-likelihood of a held-out transition %.3f.", score)
+    return replace(model, weights=weights, held_out=score)
+
+
+def _untrained(
+    states: npt.NDArray[np.floating[Any]],
+    actions: npt.NDArray[np.floating[Any]],
+    *,
+    state_layout: Layout,
+    action_layout: Layout,
+    config: BehaviorConfig,
+) -> BehaviorModel:
+    """Return a model without weights or bounds, whose normalisers fit the data."""
+    return BehaviorModel(
         state_layout=state_layout,
         action_layout=action_layout,
         config=config,
         weights={},
         states=Normalizer.fit(np.asarray(states, np.float64), state_layout),
         actions=Normalizer.fit(np.asarray(actions, np.float64), action_layout),
-        bounds=None if bounds is None else (bounds[0].copy(), bounds[1].copy()),
+        bounds=None,
         held_out=np.nan,
     )
-    with one_thread():
-        flat = initial_weights(shapes, generator)[None].to(config.device)
-        tracker = _train(blank, flat, states, actions, held=held, rng=rng, progress=progress)
-    weights = {name: weight.clone() for name, weight in unpack(tracker.weights, shapes).items()}
-    score = float(tracker.score[0]) if held.any() else np.nan
-    _logger.info("Behaviour policy: log-likelihood of a held-out transition %.3f.", score)
-    return replace(blank, weights=weights, held_out=score)
 
 
 def _train(

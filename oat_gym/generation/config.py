@@ -11,6 +11,9 @@ from oat_gym.errors import ConfigurationError
 PAPER_LEARNING_RATES = (1e-4, 3e-4, 5e-4, 7e-4, 3e-3)
 """The grid of learning rates that the paper searches (appendix B.2)."""
 
+DISCRETE_WARMUP = 100
+"""Updates over which the KL terms come in by default, where states are discrete."""
+
 MIN_GROUPS = 5
 """Fewest source episodes from which some are held out; below it nothing is, and a warning is logged."""
 
@@ -36,7 +39,9 @@ class VAEMDPConfig:
             groups nothing is held out, the training ELBO decides, and a warning is logged.
         gradient_clip: largest norm of the gradient of the loss (negative ELBO for each time step).
         scale_floor: least scale of the Gaussian heads, in standard deviations of the data.
-        kl_warmup: updates over which the weight of the KL terms rises from 0 to 1; 0 is Eq. 1 from the start.
+        kl_warmup: updates over which the weight of the KL terms rises from 0 to 1; 0 is Eq. 1 from the start. `None`:
+            `DISCRETE_WARMUP` where states have one-hot columns, since the latent states of discrete data
+            otherwise collapse to the prior and forget the actions; 0 where they have none.
         range_margin: generated values may leave the data's range by this share of it.
         device: torch device to train and sample on.
 
@@ -61,14 +66,15 @@ class VAEMDPConfig:
     validation: float = 0.2
     gradient_clip: float = 10.0
     scale_floor: float = 0.05
-    kl_warmup: int = 0
+    kl_warmup: int | None = None
     range_margin: float = 0.1
     device: str = "cpu"
 
     def __post_init__(self) -> None:
         for name in ("latent", "lstm", "dense", "batch_size", "max_updates", "evaluate_every"):
             check_integer(name, getattr(self, name), at_least=1)
-        check_integer("kl_warmup", self.kl_warmup, at_least=0)
+        if self.kl_warmup is not None:
+            check_integer("kl_warmup", self.kl_warmup, at_least=0)
         check_hidden("encoder", self.encoder)
         if self.patience is not None:
             check_integer("patience", self.patience, at_least=1)

@@ -96,8 +96,7 @@ class FittedVAEMDP:
     ) -> Samples:
         """Roll out `count` new spans: z_1, then s_t ~ p(s_t|z_t), a_t ~ beta(a_t|s_t), z_{t+1} ~ p(.|z_t, a_t), ...
 
-        The same `rng` state and arguments give the same bytes on one machine. (Another `count` may change the last
-        bits of a row as well as its noise: draw all samples of a set at once.)
+        The same `rng` state and arguments give the same bytes on one machine; another `count` gives other noise.
 
         Args:
             count: number of spans n.

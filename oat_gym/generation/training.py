@@ -118,7 +118,7 @@ def fit_many(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> list[FittedVAEMDP]:
-    """Train one VAE-MDP for each set, all in one batched network (about half the time of one after the other).
+    """Train one VAE-MDP for each set, all in one batched network (less time than one after the other).
 
     Each set has its own weights, random stream, held-out episodes, gradient norm and early stop, so its model is the
     one it would get alone, up to rounding.
@@ -157,7 +157,7 @@ class _Training:
         learning_rates = torch.tensor(config.learning_rates * len(data), dtype=torch.float32, device=config.device)
         self.adam = Adam(self.flat, learning_rates, clip=config.gradient_clip, decay=config.lr_decay)
         self.held_out = self._held_out_batch()
-        self.tracker = BestTracker(len(self.flat), patience=config.patience)
+        self.tracker = BestTracker(len(self.flat), patience=config.patience, start=network.kl_warmup)
 
     def run(self, progress: Progress | None) -> list[FittedVAEMDP]:
         """Train until every member has stopped, and return the best model of each set."""
@@ -182,11 +182,10 @@ class _Training:
 
     def _update(self, update: int) -> Tensor:
         """Make one update of every member and return each one's ELBO for a sequence, (K,)."""
-        config = self.network.config
         batch, noise, present = self._batch([s.minibatch() for s in self.streams], [s.noise for s in self.streams])
         flat = self.flat.requires_grad_()
         terms = self.network.terms(unpack(flat, self.network.shapes), batch, noise)
-        kl_weight = min(1.0, update / config.kl_warmup) if config.kl_warmup else 1.0
+        kl_weight = min(1.0, update / max(1, self.network.kl_warmup))
         # For each time step, so that the gradient's size does not grow with W.
         steps = (present[:, None] * batch.mask).sum((1, 2)) + present.sum(1)
         loss = -((terms.elbo(kl_weight) * present).sum(1) / steps).sum()

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from oat_gym.generation._layers import Weights, linear, lstm_shapes, lstm_step, mlp, mlp_shapes
-from oat_gym.generation.config import VAEMDPConfig
+from oat_gym.generation.config import DISCRETE_WARMUP, VAEMDPConfig
 from oat_gym.generation.distributions import (
     Gaussian,
     MixedHead,
@@ -90,6 +90,13 @@ class VAEMDPNetwork:
     action_layout: Layout
     config: VAEMDPConfig
     ends: bool = False
+
+    @property
+    def kl_warmup(self) -> int:
+        """Updates over which the weight of the KL terms rises from 0 to 1 in training."""
+        if self.config.kl_warmup is not None:
+            return self.config.kl_warmup
+        return DISCRETE_WARMUP if self.state_layout.categorical else 0
 
     @property
     def state_head(self) -> MixedHead:

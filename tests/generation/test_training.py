@@ -12,6 +12,8 @@ from oat_gym.generation import PAPER_LEARNING_RATES, Sequences, VAEMDPConfig, fi
 from oat_gym.generation import training as training_module
 from oat_gym.generation._tracker import BestTracker
 from oat_gym.generation.sequences import hold_out
+from oat_gym.generation.vae_mdp import VAEMDPNetwork
+from oat_gym.spaces import Layout
 
 
 def fit(kit, spans, config, seed=0, **settings):
@@ -195,3 +197,11 @@ def test_a_stopped_member_is_frozen():
     assert tracker.weights.tolist() == [[5.0] * 3, [1.0] * 3]
     assert tracker.score.tolist() == [5.0, 1.0]
     assert tracker.history(1, held_out=True)[0].tolist() == [1, 2, 3]
+
+
+def test_kl_terms_come_in_slowly_for_discrete_states_only():
+    discrete, real = Layout(2, (), ((0, 2),)), Layout(2, (0, 1), ())
+    assert VAEMDPNetwork(discrete, real, VAEMDPConfig()).kl_warmup > 0
+    assert VAEMDPNetwork(real, discrete, VAEMDPConfig()).kl_warmup == 0
+    assert VAEMDPNetwork(discrete, real, VAEMDPConfig.from_preset("paper")).kl_warmup == 0
+    assert VAEMDPNetwork(real, real, VAEMDPConfig(kl_warmup=7)).kl_warmup == 7

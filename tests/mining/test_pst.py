@@ -154,11 +154,21 @@ def test_bad_series_and_frozen_settings():
 
 @pytest.mark.shared_data
 def test_door_demonstrations(shared_data):
-    """The paper's values on the real demonstrations: 10 clusters, and a window that all 25 episodes share."""
+    """On the real demonstrations all 25 episodes share windows of up to 40 rows, whatever the switch penalty."""
     data = np.load(shared_data / "robotics" / "adroit_human" / "door_human_25demos.npz")
     series = np.split(data["observations"], np.cumsum(data["lengths"])[:-1])
-    config = MiningConfig(n_clusters="auto", candidates=tuple(range(10, 21, 2)))
+    for penalty in (4.0, 100.0):
+        config = MiningConfig(switch_penalty=penalty, init="kmeans")
+        result = mine(series, config=config, rng=np.random.default_rng(0))
+        assert result.sets[0].support == 25
+        assert count_tdss(list(result.labels), 40).support.max() == 25
+
+
+@pytest.mark.shared_data
+def test_silhouette_chooses_among_candidates_on_door_demonstrations(shared_data):
+    data = np.load(shared_data / "robotics" / "adroit_human" / "door_human_25demos.npz")
+    series = np.split(data["observations"], np.cumsum(data["lengths"])[:-1])
+    config = MiningConfig(n_clusters="auto", candidates=(10, 20), init="kmeans")
     result = mine(series, config=config, rng=np.random.default_rng(0))
     assert result.n_clusters == 10
-    assert result.sets[0].support == 25
-    assert count_tdss(list(result.labels), 40).support.max() == 25
+    assert result.criterion_scores[10] > result.criterion_scores[20]

@@ -103,7 +103,7 @@ def test_auto_takes_the_better_of_both_initialisations():
 
 
 def test_empty_clusters_are_reseeded():
-    series, truth = planted(8, 0.0)
+    series, _ = planted(8, 0.0)
     start = [np.zeros(len(x), dtype=int) for x in series]
     model = TICC(3, initial_labels=start, switch_penalty=10.0).fit(series)
     assert len(np.unique(np.concatenate(model.labels_))) == 3
