@@ -49,6 +49,8 @@ class OAT(Augmenter):
         start: where a roll-out starts: z_1 from the "prior" N(0, I), as in the paper, or from the "posterior"
             q(z_1|s_1) of the span that it replaces.
         actions: "behavior": sampled from the cloned policy, as in the paper; "recorded": those of the span replaced.
+        observation_noise: draw states and rewards from their distributions, as in the paper, or (false) take their
+            means: smoother states, since the paper's diagonal Gaussian p(s|z) adds independent noise to every step.
         seam: "contiguous" (Minari's form), "literal" (the paper's: tuples outside the span keep their own next state,
             visible in `transitions()`), or "matched" (of `candidates` samples the one with the least seam jump).
         candidates: how many samples "matched" chooses from.
@@ -65,6 +67,7 @@ class OAT(Augmenter):
     behavior: BehaviorConfig = field(default_factory=BehaviorConfig)
     start: Start = "prior"
     actions: Actions = "behavior"
+    observation_noise: bool = True
     seam: Seam = "contiguous"
     candidates: int = 16
     features: tuple[str, ...] | None = None
@@ -234,6 +237,7 @@ class OATSampler(Sampler):
             policy=self._behavior,
             actions=actions,
             start=config.start,
+            observation_noise=config.observation_noise,
             start_states=recorded[:, 0].repeat(repeats, axis=0) if config.start == "posterior" else None,
         )
         jumps = seam_jumps(samples.states, recorded.repeat(repeats, axis=0), self._scale)
