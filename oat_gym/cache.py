@@ -2,7 +2,8 @@
 
 An *entry* is the folder of one fingerprint; an *item* is one safetensors file in it (arrays, and a JSON value in its
 header), sealed with a digest of all that it holds. An item is either absent or complete: it is written beside its
-place and moved there. Nothing is ever unpickled.
+place and moved there; what a killed process left beside it goes when the entry is next locked. What a newer library
+wrote is left alone. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import hashlib
 import json
 import logging
 import os
-import tempfile
+import secrets
 import warnings
 from collections.abc import Generator, Mapping
 from dataclasses import asdict, is_dataclass
@@ -31,6 +32,8 @@ from oat_gym.errors import CacheError
 FORMAT_VERSION = 1
 """Part of every path and fingerprint: a newer library never reads, nor touches, an older one's entries."""
 
+_HEADER = "oat_gym"
+
 Arrays = dict[str, npt.NDArray[Any]]
 
 _log = logging.getLogger(__name__)
@@ -38,6 +41,10 @@ _log = logging.getLogger(__name__)
 
 class CacheWarning(UserWarning):
     """An item could not be kept on disk; the result in memory is complete, but will be made again next time."""
+
+
+class NewerFormatError(CacheError):
+    """A file was written by a newer version of the library: not damaged, not readable here, and to be left alone."""
 
 
 def cache_folder() -> Path:
@@ -94,13 +101,14 @@ class CacheEntry:
         """
         lock = FileLock(self.path.parent / f"{self.key}.lock")
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
+            self._make_folder()
             try:
                 lock.acquire(timeout=0)
             except Timeout:
                 _log.info("Waiting for another process that prepares the same data (%s).", self.path)
                 lock.acquire()
-        except OSError as error:
+            _remove_temporaries(self.path)
+        except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
             warnings.warn(f"No lock could be taken in the cache at {self.path}: {error}.", CacheWarning, stacklevel=3)
         try:
             yield
@@ -108,7 +116,9 @@ class CacheEntry:
             lock.release()
 
     def read(self, name: str) -> tuple[Arrays, Any] | None:
-        """Return (arrays, value) of an item, or None where it is absent or damaged (a damaged one is removed).
+        """Return (arrays, value) of an item, or None where it is absent, damaged or of a newer format.
+
+        A damaged one is removed; a newer one stays, with a `CacheWarning`.
 
         Raises:
             CacheError: if the file is there and cannot be read.
@@ -116,11 +126,15 @@ class CacheEntry:
         path = self._item(name)
         try:
             return read_sealed(path)
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):  # the latter: a file stands where the folder should be
+            return None
+        except NewerFormatError as error:
+            warnings.warn(f"{error} It is left alone, and the work is done again.", CacheWarning, stacklevel=3)
             return None
         except CacheError as error:
             _log.warning("%s It is made again.", error)
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a read-only disk: writing will say so
+                path.unlink(missing_ok=True)
             return None
         except OSError as error:
             raise CacheError(
@@ -129,8 +143,13 @@ class CacheEntry:
             ) from error
 
     def write(self, name: str, arrays: Mapping[str, npt.NDArray[Any]], value: object) -> bool:
-        """Store an item atomically; return whether it could be. A full disk is a `CacheWarning`."""
+        """Store an item atomically; return whether it could be. A full disk is a `CacheWarning`.
+
+        An item of a newer format is not replaced (`read` has said so).
+        """
         path = self._item(name)
+        if _is_newer(path):
+            return False
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_sealed(path, arrays, value)
@@ -147,6 +166,20 @@ class CacheEntry:
     def _item(self, name: str) -> Path:
         return self.path / f"{name}.safetensors"
 
+    def _make_folder(self) -> None:
+        if self.path.is_dir():
+            return
+        root = self.path.parents[2]
+        newer = [path.name for path in root.glob("v*") if _version(path.name[1:]) > FORMAT_VERSION]
+        if newer:
+            _log.warning(
+                "The cache at %s also holds what a newer oat_gym made (%s): it is left alone, and the work is done "
+                "again here. Update oat_gym to use it.",
+                root,
+                ", ".join(sorted(newer)),
+            )
+        self.path.mkdir(parents=True, exist_ok=True)
+
 
 def write_sealed(path: Path, arrays: Mapping[str, npt.NDArray[Any]], value: object) -> None:
     """Write arrays and a JSON value to `path` as one safetensors file with a digest, atomically.
@@ -156,8 +189,9 @@ def write_sealed(path: Path, arrays: Mapping[str, npt.NDArray[Any]], value: obje
     """
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     text = json.dumps(canonical(value), sort_keys=True)
-    header = {"value": text, "digest": _digest(contiguous, text), "format": str(FORMAT_VERSION)}
-    write_atomically(path, save(contiguous, metadata=header))
+    header = {"digest": _digest(contiguous, text), "format": FORMAT_VERSION, "value": text}
+    # Under one key: safetensors writes several in any order, and equal content is to give equal bytes.
+    write_atomically(path, save(contiguous, metadata={_HEADER: json.dumps(header, sort_keys=True)}))
 
 
 def read_sealed(path: Path) -> tuple[Arrays, Any]:
@@ -165,34 +199,72 @@ def read_sealed(path: Path) -> tuple[Arrays, Any]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        CacheError: if it is damaged: truncated, altered, or not of this format.
+        CacheError: if it is damaged: truncated or altered.
+        NewerFormatError: if a newer version of the library wrote it.
+        OSError: if it cannot be read.
     """
-    if not path.stat().st_size:
-        raise CacheError(f"{path} is damaged: it is empty.")
+    with path.open("rb") as opened:  # says what is wrong with a file that cannot be opened
+        if not opened.read(1):
+            raise CacheError(f"{path} is damaged: it is empty.")
     try:
         with safe_open(path, framework="numpy") as file:
-            header = file.metadata() or {}
+            digest, version, text = _parse_header((file.metadata() or {}).get(_HEADER, ""))
+            if version > FORMAT_VERSION:
+                raise NewerFormatError(
+                    f"{path} has format {version}, and this oat_gym reads {FORMAT_VERSION}: update oat_gym, "
+                    "or name another folder in OAT_GYM_CACHE."
+                )
             arrays = {str(name): np.array(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise CacheError(f"{path} is damaged: {error}.") from error
-    text = header.get("value", "")
-    if header.get("digest") != _digest(arrays, text):
+    if digest != _digest(arrays, text):
         raise CacheError(f"{path} is damaged: its content does not match its digest.")
     return arrays, json.loads(text)
 
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Replace the file at `path` by one that holds `data`; a crash leaves the old file or the new one, whole."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    # Not tempfile.mkstemp: its files are for their owner only, and a dataset may be shared.
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("xb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        Path(temporary).replace(path)
+        temporary.replace(path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
+
+
+def _parse_header(text: str) -> tuple[str, int, str]:
+    """Return (digest, format, value) of a header; a damaged one has a digest that matches nothing."""
+    try:
+        header: Any = json.loads(text)
+        digest, version, value = header["digest"], header["format"], header["value"]
+    except (LookupError, RecursionError, TypeError, ValueError):
+        return "", 0, ""
+    return str(digest), version if type(version) is int else 0, str(value)
+
+
+def _remove_temporaries(folder: Path) -> None:
+    """Remove what `write_atomically` left when its process was killed; the caller holds the folder's lock."""
+    for path in folder.glob(".*.safetensors.*"):
+        path.unlink(missing_ok=True)
+
+
+def _version(text: str) -> int:
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 10 else 0
+
+
+def _is_newer(path: Path) -> bool:
+    try:
+        read_sealed(path)
+    except NewerFormatError:
+        return True
+    except (OSError, CacheError):
+        return False
+    return False
 
 
 def _digest(arrays: Mapping[str, npt.NDArray[Any]], text: str) -> str:

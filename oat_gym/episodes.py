@@ -7,6 +7,7 @@ Step t goes from `observations[t]` by `actions[t]` to `observations[t+1]`: the n
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -91,8 +92,13 @@ def copy_episode(episode: EpisodeData, *, number: int) -> EpisodeData:
         rewards=episode.rewards.copy(),
         terminations=episode.terminations.copy(),
         truncations=episode.truncations.copy(),
-        infos=copy_tree(episode.infos),
+        infos=map_tree(_copy_info, episode.infos),
     )
+
+
+def _copy_info(leaf: Any) -> Any:
+    # arrow gives nested infos as arrays of dictionaries, which a plain copy would share
+    return leaf.copy() if isinstance(leaf, np.ndarray) and leaf.dtype != object else copy.deepcopy(leaf)
 
 
 def collect_transitions(

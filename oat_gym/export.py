@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
+import platform
+import re
 import shutil
+import tempfile
 from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -15,12 +19,12 @@ from minari import EpisodeData
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_dataset import parse_dataset_id
 from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
-from minari.namespace import create_namespace, list_local_namespaces
+from minari.namespace import NAMESPACE_METADATA_FILENAME
 from minari.storage import get_dataset_path
 
 from oat_gym.cache import write_atomically
 from oat_gym.episodes import plain_infos
-from oat_gym.errors import ConfigurationError, DatasetExistsError
+from oat_gym.errors import ConfigurationError, DatasetExistsError, OatGymError
 from oat_gym.serialization import metadata_to_json
 from oat_gym.spaces import map_tree, tree_length
 
@@ -41,12 +45,25 @@ _OWN_KEYS = {
 }
 
 
+_STAGING = ".oat_gym-"
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+_ERRNO = re.compile(r"errno = (\d+)")  # how HDF5 tells it in its messages
+
+_BATCH_BYTES = 64_000_000
+_EPISODE_OVERHEAD, _LEAF_OVERHEAD = 4_000, 500  # what HDF5 adds, at most, for attributes and for each array
+
+
+class SaveError(OatGymError, OSError):
+    """A dataset could not be written (a full or read-only disk); nothing of it is left, and no other was touched."""
+
+
 def check_dataset_id(dataset_id: str) -> Path:
     """Return the folder of a new dataset.
 
     Raises:
-        ConfigurationError: if the id is not of Minari's form `namespace/name-v0`.
+        ConfigurationError: if the id is not of Minari's form `namespace/name-v0`, or its namespace is a dataset.
         DatasetExistsError: if there is a dataset of this id.
+        SaveError: if Minari's folder of datasets cannot be made.
     """
     try:
         parse_dataset_id(dataset_id)
@@ -54,12 +71,16 @@ def check_dataset_id(dataset_id: str) -> Path:
         raise ConfigurationError(
             f"{dataset_id!r} is no dataset id: expected (namespace/)name-v(version), for example 'door/human-oat-v0'."
         ) from error
-    path = get_dataset_path(dataset_id)
-    if path.exists():
-        raise DatasetExistsError(
-            f"A dataset {dataset_id!r} is already at {path}; nothing was written. Choose another name or version, or "
-            f"remove it with `minari delete {dataset_id}`."
-        )
+    try:
+        path = get_dataset_path(dataset_id)
+        exists = os.path.lexists(path)
+    except OSError as error:
+        raise _save_error(dataset_id, error) from error
+    if exists:
+        raise _exists_error(dataset_id, path)
+    inside = [parent for parent in _namespaces(path) if (parent / "data").exists()]
+    if inside:
+        raise ConfigurationError(f"{dataset_id!r} lies inside the dataset at {inside[0]}: choose another namespace.")
     return path
 
 
@@ -68,21 +89,39 @@ def new_dataset_folder(dataset_id: str) -> Generator[Path]:
     """Give the empty `data` folder of a new dataset; when the block ends well it moves to its place in one step.
 
     The work is done in a hidden folder beside the datasets, which Minari does not list; it is removed when the block
-    fails, and a folder left by a killed process is removed by the next save.
+    fails, and a folder left by a killed process is removed by the next save on the same machine.
+
+    Raises:
+        DatasetExistsError: if there is a dataset of this id, at the start or (made by another process) at the end.
+        SaveError: if the disk refuses.
     """
     path = check_dataset_id(dataset_id).resolve()
     root = get_dataset_path().resolve()  # Minari cannot measure a folder by a relative path
     _remove_leftovers(root)
-    staging = root / f".oat_gym-{os.getpid()}-{path.name}"
     try:
-        (staging / "data").mkdir(parents=True)
-        yield staging / "data"
-        _make_namespace(dataset_id)
-        check_dataset_id(dataset_id)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        staging.rename(path)
+        staging = Path(tempfile.mkdtemp(prefix=f"{_STAGING}{platform.node()}-{os.getpid()}-", dir=root))
+    except OSError as error:
+        raise _save_error(dataset_id, error) from error
+    try:
+        folder = staging / path.name  # mkdtemp's own folder is for its owner only
+        (folder / "data").mkdir(parents=True)
+        yield folder / "data"
+        _publish(folder, path, dataset_id)
+    except (OSError, RuntimeError, ValueError) as error:  # HDF5 tells a full disk by any of them
+        if _is_disk_error(error):
+            raise _save_error(dataset_id, error) from error
+        raise
     finally:
         shutil.rmtree(staging, ignore_errors=True)
+
+
+def _publish(folder: Path, path: Path, dataset_id: str) -> None:
+    check_dataset_id(dataset_id)
+    try:
+        _make_namespaces(path)
+        folder.rename(path)
+    except OSError as error:
+        raise (_exists_error(dataset_id, path) if path.exists() else _save_error(dataset_id, error)) from error
 
 
 def write_dataset(
@@ -123,10 +162,56 @@ def write_dataset(
             yield _buffer(number, episode, mask, for_arrow=data_format != "hdf5")
 
     with _size_known_later(storage):
-        storage.update_episodes(buffers())
+        for batch, size in _batches(buffers()):
+            _ensure_space(data_path, size)
+            storage.update_episodes(batch)
+        _ensure_space(data_path, len(kept) * _EPISODE_OVERHEAD)
         storage.update_episode_metadata([_storable(metadata, data_format) for metadata in kept], range(len(kept)))
     _write_common_metadata(data_path, dataset_id, like)
     storage.update_metadata({"dataset_size": float(storage.get_size())})
+
+
+def _batches(buffers: Iterable[EpisodeBuffer]) -> Iterator[tuple[list[EpisodeBuffer], int]]:
+    """Yield the buffers in lists, with the bytes that each list may take on disk."""
+    batch: list[EpisodeBuffer] = []
+    size = 0
+    for buffer in buffers:
+        batch.append(buffer)
+        size += _EPISODE_OVERHEAD + sum(_stored_bytes(part) for part in vars(buffer).values())
+        if size > _BATCH_BYTES:
+            yield batch, size
+            batch, size = [], 0
+    if batch:
+        yield batch, size
+
+
+def _stored_bytes(part: Any) -> int:
+    if isinstance(part, dict):
+        return sum(_stored_bytes(value) for value in part.values())
+    if isinstance(part, np.ndarray):
+        return part.nbytes + _LEAF_OVERHEAD
+    if isinstance(part, tuple | list):
+        return sum(_stored_bytes(value) for value in part)
+    return 4 * len(part) + 16 if isinstance(part, str) else 16
+
+
+def _ensure_space(folder: Path, needed: int) -> None:
+    """Raise OSError where `needed` bytes do not fit: HDF5 that meets a full disk half-way can crash the interpreter."""
+    if hasattr(os, "posix_fallocate"):
+        with tempfile.TemporaryFile(dir=folder) as probe, _unsupported_is_fine():
+            os.posix_fallocate(probe.fileno(), 0, needed)
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise OSError(errno.ENOSPC, f"about {needed / 1e6:.1f} MB are needed and {free / 1e6:.1f} MB are free")
+
+
+@contextlib.contextmanager
+def _unsupported_is_fine() -> Generator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):
+            raise
 
 
 def _buffer(number: int, episode: EpisodeData, mask: Any, *, for_arrow: bool) -> EpisodeBuffer:
@@ -191,16 +276,47 @@ def _size_known_later(storage: MinariStorage) -> Generator[None]:
         del storage.get_size
 
 
-def _make_namespace(dataset_id: str) -> None:
-    namespace = parse_dataset_id(dataset_id)[0]
-    if namespace is not None and namespace not in list_local_namespaces():
-        create_namespace(namespace)
+def _namespaces(path: Path) -> list[Path]:
+    """Return the folders of the namespaces of the dataset at `path`, the nearest first."""
+    root = get_dataset_path().resolve()
+    return [parent for parent in path.resolve().parents if parent.is_relative_to(root) and parent != root]
+
+
+def _make_namespaces(path: Path) -> None:
+    """Make them as Minari does, but so that neither a kill nor another process at the same work can spoil them."""
+    for folder in _namespaces(path):
+        folder.mkdir(parents=True, exist_ok=True)
+        if not (folder / NAMESPACE_METADATA_FILENAME).exists():
+            write_atomically(folder / NAMESPACE_METADATA_FILENAME, b"{}")
+
+
+def _exists_error(dataset_id: str, path: Path) -> DatasetExistsError:
+    return DatasetExistsError(
+        f"A dataset {dataset_id!r} is already at {path}; nothing was written. Choose another name or version, or "
+        f"remove it with `minari delete {dataset_id}`."
+    )
+
+
+def _save_error(dataset_id: str, error: Exception) -> SaveError:
+    folder = os.environ.get("MINARI_DATASETS_PATH") or "Minari's folder of datasets"
+    return SaveError(
+        f"The dataset {dataset_id!r} could not be written to {folder} ({error}); nothing of it was left there. Free "
+        "some space, or name a folder that can be written in MINARI_DATASETS_PATH."
+    )
+
+
+def _is_disk_error(error: Exception) -> bool:
+    if isinstance(error, OatGymError):
+        return False
+    told = _ERRNO.search(str(error))
+    number = int(told.group(1)) if told else getattr(error, "errno", None)
+    return number in _DISK_ERRORS
 
 
 def _remove_leftovers(root: Path) -> None:
-    for folder in root.glob(".oat_gym-*"):
-        owner = folder.name.split("-")[1]
-        if owner.isdigit() and not _is_running(int(owner)):
+    for folder in root.glob(f"{_STAGING}{platform.node()}-*"):
+        owner = folder.name.split("-")[-2]
+        if owner.isdecimal() and not _is_running(int(owner)):
             shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -11,6 +11,9 @@ import numpy as np
 from oat_gym.episodes import BoolArray
 from oat_gym.stitching import Span, spans_mask
 
+METADATA_KEYS = ("synthetic", "source", "variation", "spans", "pst_sets", "samples", "seams")
+"""The keys of episode metadata that are ours."""
+
 
 @dataclass(frozen=True)
 class Provenance:
@@ -53,7 +56,7 @@ class Provenance:
     def from_metadata(cls, metadata: Mapping[str, Any], number: int) -> Provenance:
         """Return the provenance of episode `number` from its metadata; without our keys the episode is real."""
         length = int(metadata["total_steps"])
-        if "spans" not in metadata:
+        if not has_provenance(metadata):
             return cls(False, number, None, (), length)
         rows = zip(
             np.asarray(metadata["spans"], dtype=np.int64).reshape(-1, 2),
@@ -68,6 +71,11 @@ class Provenance:
         )
         variation = _known(metadata["variation"])
         return cls(bool(metadata["synthetic"]), int(metadata["source"]), variation, spans, length)
+
+
+def has_provenance(metadata: Mapping[str, Any]) -> bool:
+    """Whether episode metadata holds a provenance: all our keys, since users have keys called "source" too."""
+    return all(key in metadata for key in METADATA_KEYS)
 
 
 def merge_spans(old: tuple[Span, ...], new: tuple[Span, ...]) -> tuple[Span, ...]:

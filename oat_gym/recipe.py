@@ -1,46 +1,79 @@
 """Recipes: a few kB that describe an augmented dataset, and how a source is found again.
 
 A recipe names its source by Minari id and content hash, never by a path, and its augmenter by its name in
-`AUGMENTERS` and its settings; reading one runs no code but the package's own.
+`AUGMENTERS` and its settings; reading one runs no code but the package's own. A folder that someone else made is
+checked before anything in it is followed (`check_folder`).
 """
 
 from __future__ import annotations
 
 import json
 import pathlib
+import re
 from typing import Any
 
+import h5py
 import minari
 import numpy as np
 from minari import MinariDataset
 from minari.dataset.minari_dataset import parse_dataset_id
+from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
+from minari.serialization import deserialize_space
 from minari.storage import get_dataset_path
 
 from oat_gym.augmenters import AUGMENTERS
 from oat_gym.cache import FORMAT_VERSION, canonical
 from oat_gym.embedded import EMBEDDED, embedded_path
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError, OatGymError
-from oat_gym.serialization import config_from_json
+from oat_gym.serialization import config_from_json, read_json
 from oat_gym.source import Source
 from oat_gym.synthesis import Synthesis
 
 RECIPE_FILE = "recipe.json"
+DATA_FORMAT = "oat"
+APPENDED = "appended"
+EPISODE_METADATA_FILE = "episode_metadata.json"
 LIVE_RECIPE = {"live": True}
 """Stands in a temporary directory, which is of use only to the process that made it."""
+
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_METADATA_TYPES = {
+    "total_episodes": int,
+    "total_steps": int,
+    "data_format": str,
+    "observation_space": str,
+    "action_space": str,
+}
+# What Minari, Gymnasium and h5py raise on files that are not what they expect.
+_DAMAGE = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,  # RecursionError and NotImplementedError are among them
+    TypeError,
+    ValueError,
+)
 
 
 def find_dataset(name: str) -> MinariDataset:
     """Return the dataset of a Minari id: from Minari's local datasets, or an embedded one.
 
     Raises:
+        ConfigurationError: if it is no id.
         DatasetNotFoundError: if it is not on this machine; nothing is downloaded.
+        InvalidDataError: if it is there and cannot be opened.
     """
     try:
         parse_dataset_id(name)  # also keeps "../" and absolute paths out
-    except (TypeError, ValueError) as error:
+        data_path = get_dataset_path(name) / "data"
+        exists = data_path.exists()
+    except (OSError, TypeError, ValueError) as error:
         raise ConfigurationError(f"{name!r} is no dataset id of the form namespace/name-v0.") from error
-    if (get_dataset_path(name) / "data").exists():
-        return minari.load_dataset(name)
+    if exists:
+        return _load(name, data_path)
     if name in EMBEDDED:
         return MinariDataset(embedded_path(name))
     raise DatasetNotFoundError(
@@ -49,12 +82,28 @@ def find_dataset(name: str) -> MinariDataset:
     )
 
 
+def _load(name: str, data_path: pathlib.Path) -> MinariDataset:
+    try:
+        if MinariStorage.read_raw_metadata(data_path).get("data_format") == DATA_FORMAT:
+            check_folder(data_path)
+        return minari.load_dataset(name)
+    except OatGymError:
+        raise
+    except RecursionError as error:
+        raise InvalidDataError(f"The dataset {name!r} is its own source, directly or through others.") from error
+    except _DAMAGE as error:
+        raise InvalidDataError(
+            f"The dataset {name!r} at {data_path} cannot be opened ({type(error).__name__}: {error}). Restore it, or "
+            f"get it again with `minari download {name}`."
+        ) from error
+
+
 def write_recipe(synthesis: Synthesis) -> bytes:
     """Return the recipe of a plan as JSON bytes.
 
     Raises:
-        ConfigurationError: if another machine could not follow it: a source without a dataset of its own on disk, or
-            an augmenter that is the user's own code.
+        ConfigurationError: if another machine could not follow it: a source without a dataset of its own on disk, an
+            augmenter that is the user's own code, or a setting that JSON does not give back.
     """
     augmenter, dataset = synthesis.augmenter, synthesis.source.dataset
     if AUGMENTERS.get(augmenter.name) is not type(augmenter):
@@ -71,6 +120,11 @@ def write_recipe(synthesis: Synthesis) -> bytes:
             f"The source calls itself {dataset.id!r} but is another dataset than the installed one of that id. Save "
             "it under an id of its own first, or save the episodes themselves (lazy=False)."
         )
+    settings = canonical(augmenter)
+    try:
+        config_from_json(type(augmenter), json.loads(json.dumps(settings)))
+    except InvalidDataError as error:
+        raise ConfigurationError(f"{augmenter!r} cannot be kept in a recipe: {error}") from error
     everything = np.array_equal(synthesis.source.ids, np.arange(found.storage.total_episodes))
     recipe = {
         "format": FORMAT_VERSION,
@@ -79,7 +133,7 @@ def write_recipe(synthesis: Synthesis) -> bytes:
             "episodes": None if everything else synthesis.source.ids.tolist(),
             "content": synthesis.source.fingerprint,
         },
-        "augmenter": {"name": augmenter.name, "settings": canonical(augmenter)},
+        "augmenter": {"name": augmenter.name, "settings": settings},
         "count": synthesis.count,
         "seed": synthesis.seed,
     }
@@ -90,14 +144,16 @@ def open_recipe(data_path: pathlib.Path) -> Synthesis | None:
     """Return the plan that a dataset directory describes; None where it has none (all its episodes were appended).
 
     Raises:
-        InvalidDataError: for a recipe that is damaged, of a newer format, or of another process.
+        InvalidDataError: for a recipe that is damaged, of a newer format, or of another process, and for a folder that
+            `check_folder` refuses.
         DatasetNotFoundError: if the source is not on this machine.
     """
+    check_folder(data_path)
     path = data_path / RECIPE_FILE
     if not path.exists():
         return None
+    recipe = read_json(path)
     try:
-        recipe: Any = json.loads(path.read_text())
         if recipe == LIVE_RECIPE:
             raise InvalidDataError(
                 f"{data_path} belongs to an augmented dataset in the memory of another process. Save it there with "
@@ -107,24 +163,125 @@ def open_recipe(data_path: pathlib.Path) -> Synthesis | None:
             raise InvalidDataError(
                 f"{path} has format {recipe['format']!r}; this version reads {FORMAT_VERSION}: update oat_gym."
             )
-        return _plan_of(recipe, path)
+        plan = _plan_of(recipe, path)
     except OatGymError:
         raise
-    except (KeyError, TypeError, AttributeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+    except _DAMAGE as error:
         raise InvalidDataError(f"{path} is damaged or no recipe of oat_gym: {error!r}.") from error
+    _check_spaces(data_path, plan.source)
+    return plan
 
 
 def _plan_of(recipe: dict[str, Any], path: pathlib.Path) -> Synthesis:
-    name = recipe["augmenter"]["name"]
-    if name not in AUGMENTERS:
+    name, origin = recipe["augmenter"]["name"], recipe["source"]
+    if not isinstance(name, str) or name not in AUGMENTERS:
         raise InvalidDataError(f"{path} names the augmenter {name!r}; known are {', '.join(AUGMENTERS)}.")
+    if not isinstance(origin["content"], str) or not _SHA256.fullmatch(origin["content"]):
+        raise InvalidDataError(f"{path} gives {origin['content']!r} for the SHA-256 of its source's content.")
     augmenter = config_from_json(AUGMENTERS[name], recipe["augmenter"]["settings"])
-    dataset = find_dataset(str(recipe["source"]["id"]))
-    episodes = recipe["source"]["episodes"]
+    dataset, episodes = find_dataset(origin["id"]), origin["episodes"]
     if episodes is not None:
-        indices = np.asarray(episodes, dtype=np.int64)
-        if indices.ndim != 1 or not np.isin(indices, np.arange(dataset.storage.total_episodes)).all():
+        total = dataset.storage.total_episodes
+        if not isinstance(episodes, list) or not all(type(one) is int and 0 <= one < total for one in episodes):
             raise InvalidDataError(f"{path} names episodes that {dataset.id!r} does not have.")
-        dataset = MinariDataset(dataset.storage, episode_indices=indices)
-    source = Source(dataset, expected_fingerprint=str(recipe["source"]["content"]))
+        dataset = MinariDataset(dataset.storage, episode_indices=np.array(episodes, dtype=np.int64))
+    source = Source(dataset, expected_fingerprint=origin["content"])
     return Synthesis(source, augmenter, count=recipe["count"], seed=recipe["seed"])
+
+
+def check_folder(data_path: pathlib.Path) -> None:
+    """Check the folder of an augmented dataset before anything that it says is believed; reads no recipe.
+
+    Raises:
+        InvalidDataError: for a link (symbolic, or inside an HDF5 file), for metadata without spaces (Minari would make
+            them by running the environment that the metadata names) or of wrong types, and for an appended part that
+            does not have the episodes and steps that it claims.
+    """
+    for path in data_path.rglob("*"):
+        if path.is_symlink():
+            raise InvalidDataError(f"{path} is a link: a dataset's folder must hold its files itself.")
+        if path.suffix == ".hdf5" and path.stat().st_size:
+            _check_hdf5(path)
+    metadata = _check_metadata(data_path)
+    appended = data_path / APPENDED
+    episodes = steps = 0
+    if (appended / METADATA_FILE_NAME).exists():
+        episodes, steps = _check_appended(appended)
+    if not (data_path / RECIPE_FILE).exists() and (metadata["total_episodes"], metadata["total_steps"]) != (
+        episodes,
+        steps,
+    ):
+        raise InvalidDataError(
+            f"The metadata at {data_path} says {metadata['total_episodes']} episodes and {metadata['total_steps']} "
+            f"steps, and there are {episodes} and {steps}: it is damaged, or its {RECIPE_FILE} is missing."
+        )
+    edits = data_path / EPISODE_METADATA_FILE
+    if edits.exists():
+        _check_edits(edits, metadata["total_episodes"])
+
+
+def _check_metadata(data_path: pathlib.Path) -> dict[str, Any]:
+    path = data_path / METADATA_FILE_NAME
+    metadata = read_json(path)
+    for key, kind in _METADATA_TYPES.items():
+        value: Any = metadata.get(key) if isinstance(metadata, dict) else None
+        if type(value) is not kind or (isinstance(value, int) and value < 0):
+            raise InvalidDataError(f"{path} is damaged: {key!r} is {value!r}, expected {kind.__name__}.")
+    for key in ("observation_space", "action_space"):
+        try:
+            deserialize_space(metadata[key])
+        except _DAMAGE as error:
+            raise InvalidDataError(f"{path} is damaged: its {key!r} is no space ({error!r}).") from error
+    return metadata
+
+
+def _check_appended(appended: pathlib.Path) -> tuple[int, int]:
+    """Return the episodes and steps of the appended part, counted."""
+    claimed = _check_metadata(appended)
+    if claimed["data_format"] not in ("hdf5", "arrow", "parquet"):
+        raise InvalidDataError(f"{appended} has the format {claimed['data_format']!r}, which no appended part has.")
+    total = claimed["total_episodes"]
+    try:
+        storage = MinariStorage.read(appended)
+        steps = sum(int(part["total_steps"]) for part in storage.get_episode_metadata(range(total)))
+    except _DAMAGE as error:
+        raise InvalidDataError(f"{appended} is damaged: it lacks some of its {total} episodes ({error!r}).") from error
+    if steps != claimed["total_steps"]:
+        raise InvalidDataError(f"{appended} has {steps} steps where its metadata says {claimed['total_steps']}.")
+    return total, steps
+
+
+def _check_edits(path: pathlib.Path, total: int) -> None:
+    edits = read_json(path)
+    numbers = {str(number) for number in range(min(total, len(edits)))} if isinstance(edits, dict) else set[str]()
+    for key, value in edits.items() if isinstance(edits, dict) else [("it", edits)]:
+        known = key in numbers or (key.isascii() and key.isdecimal() and int(key) < total)
+        if not known or not isinstance(value, dict):
+            raise InvalidDataError(f"{path} is damaged: {key!r} names no episode of {total}, or no metadata of one.")
+
+
+def _check_hdf5(path: pathlib.Path) -> None:
+    def check(name: str, link: Any) -> None:
+        if not isinstance(link, h5py.HardLink):
+            raise InvalidDataError(f"{path} holds a link to other data at {name!r}, which no Minari file does.")
+        part = file[name]
+        if isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
+            raise InvalidDataError(f"{path} keeps {name!r} in another file, which no Minari file does.")
+
+    try:
+        with h5py.File(path, "r") as file:
+            file.visititems_links(check)
+    except OatGymError:
+        raise
+    except _DAMAGE as error:
+        raise InvalidDataError(f"{path} is damaged: {error}") from error
+
+
+def _check_spaces(data_path: pathlib.Path, source: Source) -> None:
+    metadata = read_json(data_path / METADATA_FILE_NAME)
+    for key, space in (("observation_space", source.observation_space), ("action_space", source.action_space)):
+        if deserialize_space(metadata[key]) != space:
+            raise InvalidDataError(
+                f"The metadata at {data_path} gives another {key} than the source {source.dataset.id!r}, {space}: one "
+                "of them was changed. Save the dataset again."
+            )

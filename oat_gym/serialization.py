@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import math
+import types
 import typing
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,13 +19,28 @@ from minari.serialization import serialize_space
 from oat_gym.errors import InvalidDataError
 
 
+def read_json(path: Path) -> Any:
+    """Return what a JSON file holds.
+
+    Raises:
+        InvalidDataError: if it cannot be read, is no JSON, or is nested too deeply.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InvalidDataError(
+            f"{path} is damaged, or was not written by oat_gym ({error}). Restore it, or save the dataset again."
+        ) from error
+
+
 def config_from_json(cls: type[Any], value: Mapping[str, Any]) -> Any:
     """Return the frozen dataclass `cls` whose canonical JSON (`oat_gym.cache.canonical`) is `value`.
 
     Nested dataclasses are those that the field's annotation names; lists become tuples.
 
     Raises:
-        InvalidDataError: if `value` is not of this class or a field is missing, unknown or out of its range.
+        InvalidDataError: if `value` is not of this class or a field is missing, unknown, of another type than its
+            annotation, or out of its range.
     """
     names = {field.name for field in dataclasses.fields(cls)}
     if not isinstance(value, Mapping) or value.get("class") != cls.__name__ or set(value) - {"class"} != names:
@@ -29,7 +48,7 @@ def config_from_json(cls: type[Any], value: Mapping[str, Any]) -> Any:
     hints = typing.get_type_hints(cls)
     try:
         return cls(**{name: _field_from_json(hints[name], value[name]) for name in names})
-    except (TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise InvalidDataError(f"The settings of {cls.__name__} cannot be read: {error}") from error
 
 
@@ -41,8 +60,35 @@ def _field_from_json(hint: Any, value: Any) -> Any:
                 return config_from_json(typing.cast("type[Any]", candidate), value)
         raise InvalidDataError(f"Unknown settings {value.get('class')!r} for a field of type {hint}.")
     if isinstance(value, list):
-        return tuple(_field_from_json(Any, item) for item in value)
+        value = _tuples(value)
+    if not _fits(hint, value):
+        raise InvalidDataError(f"A setting has the value {value!r}, and {hint} is expected.")
     return value
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+def _fits(hint: Any, value: Any) -> bool:
+    """Return whether a plain value is one that the annotation of a setting allows; NaN is none."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(argument, value) for argument in arguments)
+    if origin is typing.Literal:
+        return any(type(value) is type(argument) and value == argument for argument in arguments)
+    if origin is tuple:
+        expected = arguments[:1] * len(value) if arguments[1:] == (...,) and isinstance(value, tuple) else arguments
+        return (
+            isinstance(value, tuple)
+            and len(value) == len(expected)
+            and all(_fits(one, item) for one, item in zip(expected, value, strict=True))
+        )
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return hint is Any or (isinstance(hint, type) and isinstance(value, hint))
 
 
 def metadata_to_json(value: Any) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import warnings
 from functools import cached_property
 from typing import Any
 
@@ -12,6 +14,7 @@ from minari import EpisodeData, MinariDataset
 
 from oat_gym.episodes import IntArray, check_episode, content_hash
 from oat_gym.errors import InvalidDataError, SourceChangedError
+from oat_gym.provenance import METADATA_KEYS, has_provenance
 from oat_gym.spaces import FlatSpace
 
 
@@ -39,10 +42,30 @@ class Source:
         """The storage id of each episode, (N,)."""
         return np.array(self.dataset.episode_indices, dtype=np.int64)
 
+    @property
+    def view(self) -> MinariDataset:
+        """The dataset restricted to these episodes, whatever becomes of the indices of the user's own view."""
+        view = copy.copy(self.dataset)
+        view.episode_indices = self.ids
+        return view
+
     @cached_property
     def metadata(self) -> tuple[dict[str, Any], ...]:
-        """The metadata that the storage keeps for each episode."""
-        return tuple(self.dataset.storage.get_episode_metadata(self.ids))
+        """The metadata that the storage keeps for each episode.
+
+        A key of the user's that is also one of ours (`METADATA_KEYS`) is renamed to `original_<key>`, with a warning.
+        """
+        metadata = tuple(self.dataset.storage.get_episode_metadata(self.ids))
+        clashes = {key for part in metadata if not has_provenance(part) for key in METADATA_KEYS if key in part}
+        if not clashes:
+            return metadata
+        warnings.warn(
+            f"The episode metadata of {self.dataset.id!r} has keys that tell provenance in an augmented dataset: "
+            f"{', '.join(sorted(clashes))}. There they are renamed, with 'original_' before the name.",
+            UserWarning,
+            stacklevel=2,
+        )
+        return tuple(part if has_provenance(part) else _rename_clashes(part) for part in metadata)
 
     @cached_property
     def lengths(self) -> IntArray:
@@ -68,16 +91,20 @@ class Source:
     def episodes(self) -> tuple[EpisodeData, ...]:
         """All episodes, checked against the T+1 rule and against the lengths that the storage claims."""
         episodes = tuple(EpisodeData(**data) for data in self.dataset.storage.get_episodes(list(self.ids)))
-        for number, (episode, length) in enumerate(zip(episodes, self.lengths, strict=True)):
+        for number, episode in enumerate(episodes):
             check_episode(episode, self.observation_space, self.action_space)
-            if len(episode.rewards) != length:
-                raise InvalidDataError(
-                    f"Episode {number} of {self.dataset.id!r} gives {len(episode.rewards)} steps where its metadata "
-                    f"says {length}. Arrow and Parquet storages cut episodes over 32,767 rows (Minari issue 351): "
-                    "store the dataset as HDF5."
-                )
+            self.check_length(number, len(episode.rewards))
         self._check_fingerprint(episodes)
         return episodes
+
+    def check_length(self, number: int, length: int) -> None:
+        """Raise `InvalidDataError` unless `length`, what was read, is what the metadata of episode `number` says."""
+        if length != self.lengths[number]:
+            raise InvalidDataError(
+                f"Episode {number} of {self.dataset.id!r} gives {length} steps where its metadata says "
+                f"{self.lengths[number]}. Arrow and Parquet storages cut episodes over 32,767 rows (Minari issue 351): "
+                "store the dataset as HDF5."
+            )
 
     def _check_fingerprint(self, episodes: tuple[EpisodeData, ...]) -> None:
         if self.expected_fingerprint and content_hash(episodes) != self.expected_fingerprint:
@@ -125,6 +152,10 @@ class Source:
             _finite(np.asarray(episode.rewards, dtype=np.float64), "reward", number)
             for number, episode in enumerate(self.episodes)
         ]
+
+
+def _rename_clashes(metadata: dict[str, Any]) -> dict[str, Any]:
+    return {f"original_{key}" if key in METADATA_KEYS else key: value for key, value in metadata.items()}
 
 
 def _finite(values: npt.NDArray[np.float64], what: str, number: int) -> npt.NDArray[np.float64]:

@@ -7,6 +7,7 @@ written to. The directory is a temporary one until the dataset is saved as a rec
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import itertools
 import json
@@ -66,8 +67,7 @@ class AugmentedStorage(MinariStorage):
         if self.synthesis is not None:
             source_format = self.synthesis.source.dataset.storage.FORMAT
             self.FORMAT = source_format  # pyright: ignore[reportConstantRedefinition]  (a class attribute in Minari)
-        appended = self.data_path / APPENDED
-        self._appended = MinariStorage.read(appended) if (appended / METADATA_FILE_NAME).exists() else None
+        self._appended: MinariStorage | None = None
         if live is None and self.synthesis is not None:
             self._check_totals(self.synthesis)
 
@@ -96,7 +96,7 @@ class AugmentedStorage(MinariStorage):
         if self.synthesis is None or str(self.data_path) not in _live:
             return MinariStorage.read, (str(self.data_path),)
         plan = self.synthesis
-        return _reopen, (str(self.data_path), plan.source.dataset, plan.augmenter, plan.count, plan.seed)
+        return _reopen, (str(self.data_path), plan.source.view, plan.augmenter, plan.count, plan.seed)
 
     @property
     def n_real(self) -> int:
@@ -115,8 +115,8 @@ class AugmentedStorage(MinariStorage):
         planned = ids < self.n_planned
         if self.synthesis is not None:
             out[planned] = self.synthesis.lengths[ids[planned]]
-        if self._appended is not None:
-            metadata = self._appended.get_episode_metadata(ids[~planned] - self.n_planned)
+        if not planned.all():
+            metadata = self._appended_storage().get_episode_metadata(ids[~planned] - self.n_planned)
             out[~planned] = [part["total_steps"] for part in metadata]
         return out
 
@@ -154,14 +154,14 @@ class AugmentedStorage(MinariStorage):
 
     def get_episode_metadata(self, episode_indices: Iterable[int]) -> Iterator[dict[str, Any]]:
         """Yield the source's metadata of each episode with its provenance (see `Provenance.to_metadata`)."""
-        edits, total = self._edited_metadata(), self.total_episodes
+        edits, total = self.edited_metadata(), self.total_episodes
         for number in map(int, episode_indices):
             if self._kind(number, total) == "appended":
                 local = number - self.n_planned
                 metadata = dict(next(iter(self._appended_storage().get_episode_metadata([local]))))
             else:
                 source = number if number < self.n_real else (number - self.n_real) % self.n_real
-                metadata = dict(self._plan().source.metadata[source])
+                metadata = copy.deepcopy(self._plan().source.metadata[source])  # options nest, and users may edit them
                 metadata |= self.provenance(number).to_metadata()
                 metadata["total_steps"] = int(self._plan().lengths[number])
             yield metadata | {"id": number} | edits.get(str(number), {})
@@ -174,8 +174,10 @@ class AugmentedStorage(MinariStorage):
         updates = list(metadatas)
         if len(indices) != len(updates):
             raise ValueError("Metadatas and episode_indices have different lengths")
-        edits = self._edited_metadata()
+        edits = self.edited_metadata()
+        total = self.total_episodes
         for number, update in zip(map(int, indices), updates, strict=True):
+            self._kind(number, total)
             edits[str(number)] = edits.get(str(number), {}) | metadata_to_json(update)
         write_atomically(self.data_path / EPISODE_METADATA_FILE, json.dumps(edits).encode())
         self.update_metadata({"dataset_size": self.get_size()})
@@ -202,6 +204,11 @@ class AugmentedStorage(MinariStorage):
         }
         self.update_metadata({**totals, "dataset_size": self.get_size()})
 
+    def edited_metadata(self) -> dict[str, dict[str, Any]]:
+        """Return the metadata added by `update_episode_metadata`, by the number of the episode as a string."""
+        path = self.data_path / EPISODE_METADATA_FILE
+        return json.loads(path.read_text()) if path.exists() else {}
+
     def get_size(self) -> float:
         """Return the size of the source and of our own files, in MB."""
         source = self.synthesis.source.dataset.storage.get_size() if self.synthesis else 0.0
@@ -215,7 +222,7 @@ class AugmentedStorage(MinariStorage):
         return "synthetic" if number < self.n_planned else "appended"
 
     def _check_totals(self, synthesis: Synthesis) -> None:
-        appended = self._appended
+        appended = self._appended_storage() if (self.data_path / APPENDED).exists() else None
         episodes = self.n_planned + (appended.total_episodes if appended else 0)
         claimed = (self.total_episodes, self.total_steps)
         if claimed[0] == episodes:
@@ -239,6 +246,7 @@ class AugmentedStorage(MinariStorage):
             return
         stored = source.dataset.storage.get_episodes(list(source.ids[numbers]))
         for number, data in zip(numbers, stored, strict=True):
+            source.check_length(int(number), len(data["rewards"]))
             yield {**data, "id": number}
 
     def _appended_episodes(self, numbers: list[int]) -> Iterator[dict[str, Any]]:
@@ -247,10 +255,14 @@ class AugmentedStorage(MinariStorage):
             yield {**data, "id": number}
 
     def _appended_storage(self) -> MinariStorage:
-        if self._appended is None:
+        """Return the side store, which another dataset on this directory (a split, a copy) may have begun."""
+        path = self.data_path / APPENDED
+        if self._appended is None and (path / METADATA_FILE_NAME).exists():
+            self._appended = MinariStorage.read(path)
+        elif self._appended is None:
             formats = {DATA_FORMAT: "hdf5"}
             self._appended = MinariStorage.new(
-                self.data_path / APPENDED,
+                path,
                 observation_space=self.observation_space,
                 action_space=self.action_space,
                 data_format=formats.get(self.FORMAT, self.FORMAT),
@@ -263,10 +275,6 @@ class AugmentedStorage(MinariStorage):
         inherited = Provenance.from_metadata(source.metadata[number], number)
         position = np.flatnonzero(source.ids == inherited.source) if inherited.synthetic else [number]
         return dataclasses.replace(inherited, source=int(position[0]) if len(position) else -1)
-
-    def _edited_metadata(self) -> dict[str, dict[str, Any]]:
-        path = self.data_path / EPISODE_METADATA_FILE
-        return json.loads(path.read_text()) if path.exists() else {}
 
 
 def register() -> None:

@@ -16,6 +16,9 @@ from oat_gym.errors import ConfigurationError
 from oat_gym.progress import ProgressCallback, progress_bar
 from oat_gym.source import Source
 
+MAX_COUNT = 10_000_000
+"""Most synthetic episodes of one dataset: a plan keeps a length for each, and a recipe may ask for anything."""
+
 
 class Synthesis:
     """`count` synthetic episodes of `source` by `augmenter`, of which nothing is made before it is asked for.
@@ -27,6 +30,8 @@ class Synthesis:
     def __init__(self, source: Source, augmenter: Augmenter, *, count: int, seed: int) -> None:
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 0:
             raise ConfigurationError(f"count must be an integer of at least 0, got {count!r}.")
+        if count > MAX_COUNT:
+            raise ConfigurationError(f"count may be {MAX_COUNT} at most, got {count}: make several datasets of them.")
         self.source = source
         self.augmenter = augmenter
         self.count = int(count)

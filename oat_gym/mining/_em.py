@@ -43,7 +43,7 @@ class State:
         labels: (n,) labels.
         means: (C, d) cluster means.
         precisions: (C, d, d) block-Toeplitz precisions.
-        scores: (n, C) penalised log-likelihood of each row under each cluster.
+        scores: (n, C) log-likelihood of each row under each cluster.
         iterates: where each cluster's ADMM stands.
         fitted: (n,) the labels that the clusters were fitted to (-1: none).
         tolerance: the ADMM tolerance of the last fit.
@@ -60,11 +60,11 @@ class State:
     objective: float
 
 
-def row_scores(windows: Floats, mean: Floats, precision: Floats, sparsity: float) -> Floats:
-    """Return (n,) Gaussian log-likelihoods less `sparsity / 2 * sum |precision|` (the paper's Eq. 2, penalised)."""
+def row_scores(windows: Floats, mean: Floats, precision: Floats) -> Floats:
+    """Return the (n,) Gaussian log-likelihoods of the windows (the first term of the paper's Eq. 2)."""
     root = np.linalg.cholesky(precision)
     shift = mean @ root
-    constant = np.log(np.diag(root)).sum() - 0.5 * (len(mean) * np.log(2 * np.pi) + sparsity * np.abs(precision).sum())
+    constant = np.log(np.diag(root)).sum() - 0.5 * len(mean) * np.log(2 * np.pi)
     scores = np.empty(len(windows))
     for begin in range(0, len(windows), _CHUNK):  # bounds the memory of the product
         whitened = windows[begin : begin + _CHUNK] @ root - shift
@@ -72,9 +72,9 @@ def row_scores(windows: Floats, mean: Floats, precision: Floats, sparsity: float
     return scores
 
 
-def score_table(windows: Floats, means: Floats, precisions: Floats, sparsity: float) -> Floats:
+def score_table(windows: Floats, means: Floats, precisions: Floats) -> Floats:
     """Return the (n, C) scores of every row under every cluster."""
-    columns = [row_scores(windows, m, p, sparsity) for m, p in zip(means, precisions, strict=True)]
+    columns = [row_scores(windows, m, p) for m, p in zip(means, precisions, strict=True)]
     return np.stack(columns, axis=1)
 
 
@@ -88,7 +88,7 @@ def first_state(problem: Problem, labels: Ints) -> State:
     everywhere, _ = toeplitz_graphical_lasso(covariance, window=problem.window, sparsity=problem.sparsity)
     n, size, count = len(x), x.shape[1], problem.n_clusters
     begin = cold_start(np.repeat(covariance, count, axis=0), problem.window, problem.sparsity)
-    scores = np.repeat(row_scores(x, x.mean(axis=0), everywhere[0], problem.sparsity)[:, None], count, axis=1)
+    scores = np.repeat(row_scores(x, x.mean(axis=0), everywhere[0])[:, None], count, axis=1)
     blank = State(
         labels=labels,
         means=np.repeat(x.mean(axis=0)[None], count, axis=0),
@@ -142,7 +142,7 @@ def _fit_clusters(problem: Problem, state: State, clusters: Ints, tolerance: flo
         better = lasso_cost(covariances, found, problem.sparsity) < before
         precisions[clusters[better]] = found[better]
     for c in clusters:
-        scores[:, c] = row_scores(problem.windows, means[c], precisions[c], problem.sparsity)
+        scores[:, c] = row_scores(problem.windows, means[c], precisions[c])
     return replace(
         state,
         means=means,
@@ -215,5 +215,5 @@ def run_em(
 
 def objective_of(problem: Problem, labels: Ints, means: Floats, precisions: Floats) -> float:
     """Return the objective of any labels under any clusters (the class `TICC` defines it)."""
-    scores = score_table(problem.windows, means, precisions, problem.sparsity)
+    scores = score_table(problem.windows, means, precisions)
     return path_score(scores, problem.penalties, problem.starts, labels)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -16,7 +16,7 @@ from oat_gym.mining.ticc import TICC, Initialisation
 
 Progress = Callable[[str, int, int], None]
 
-_SILHOUETTE_ROWS = 5000
+_SILHOUETTE_ROWS = 3000
 
 
 class TICCSettings(Protocol):
@@ -32,6 +32,8 @@ class TICCSettings(Protocol):
     def max_iterations(self) -> int: ...
     @property
     def init(self) -> Initialisation: ...
+    @property
+    def restarts(self) -> int: ...
 
 
 def choose_clusters(
@@ -44,38 +46,71 @@ def choose_clusters(
     times: Sequence[ArrayLike] | None = None,
     progress: Progress | None = None,
 ) -> tuple[TICC, dict[int, float]]:
-    """Fit TICC for each candidate and return the best model and `{C: score}` (empty for a single candidate).
+    """Choose the number of clusters and return the best model found for it and `{C: score}` (empty for one candidate).
 
-    All candidates share the seed and the rows of the silhouette, so that scores differ by C only.
+    TICC finds local optima, and the silhouette of one fit says more about its start than about C. So each candidate
+    is fitted from `settings.restarts` k-means starts. Its silhouette is their mean, and of the candidates that are not
+    significantly worse than the best the one with the fewest clusters wins. Its BIC is the lowest found.
     """
-    seed = int(rng.integers(2**31))
+    seeds = [int(seed) for seed in rng.integers(2**31, size=settings.restarts)]
+    report: Progress = progress or _silent
+    if len(candidates) == 1:
+        return _fit(series, candidates[0], settings, seeds[0], times, settings.init, report), {}
     rows = join_series(series)
     sample = np.sort(rng.permutation(len(rows.values))[:_SILHOUETTE_ROWS])
-    best: TICC | None = None
-    scores: dict[int, float] = {}
-    for count in candidates:
-        model = TICC(
-            count,
-            settings.window,
-            settings.sparsity,
-            settings.switch_penalty,
-            max_iterations=settings.max_iterations,
-            seed=seed,
-            init=settings.init,
-        ).fit(series, times=times, progress=progress)
-        if len(candidates) == 1:
-            return model, {}
+    found: dict[int, list[float]] = {}
+    for number, count in enumerate(candidates):
+        report("choosing the number of clusters", number, len(candidates))
+        models = (_fit(series, count, settings, seed, times, "kmeans", _silent) for seed in seeds)
         with threadpool_limits(limits=1):
-            scores[count] = silhouette(model, rows, sample) if criterion == "silhouette" else bic(model, rows)
-        if best is None or _better(scores[count], scores[best.n_clusters], criterion):
-            best = model
-    if best is None:
-        raise ValueError("candidates is empty")
-    return best, scores
+            found[count] = [silhouette(m, rows, sample) if criterion == "silhouette" else bic(m, rows) for m in models]
+    report("choosing the number of clusters", len(candidates), len(candidates))
+    chosen = fewest_not_worse(found) if criterion == "silhouette" else min(found, key=lambda c: min(found[c]))
+    inits = [*(("kmeans", seed) for seed in seeds), *([("gmm", seeds[0])] if settings.init != "kmeans" else [])]
+    final = [_fit(series, chosen, settings, seed, times, init, report) for init, seed in inits]
+    summary = np.mean if criterion == "silhouette" else np.min
+    return max(final, key=lambda model: model.objective_), {c: float(summary(found[c])) for c in candidates}
 
 
-def _better(new: float, old: float, criterion: str) -> bool:
-    return new > old if criterion == "silhouette" else new < old
+def fewest_not_worse(scores: Mapping[int, Sequence[float]]) -> int:
+    """Return the smallest key whose mean score (higher is better) is not significantly below the best mean.
+
+    Significant is a difference of more than 1.96 of its standard errors, which is estimated from the repeats of all
+    keys together; with one score a key it is 0 and the best key wins.
+
+    >>> fewest_not_worse({10: [0.20, 0.22], 11: [0.21, 0.22], 12: [0.10, 0.12]})
+    10
+    """
+    means = {key: float(np.mean(values)) for key, values in scores.items()}
+    repeats = min(len(values) for values in scores.values())
+    spread = float(np.mean([np.var(values, ddof=1) for values in scores.values()])) if repeats > 1 else 0.0
+    allowed = 1.96 * float(np.sqrt(2 * spread / repeats))
+    return min(key for key, mean in means.items() if mean >= max(means.values()) - allowed)
+
+
+def _fit(
+    series: Sequence[ArrayLike],
+    count: int,
+    settings: TICCSettings,
+    seed: int,
+    times: Sequence[ArrayLike] | None,
+    init: Initialisation,
+    progress: Progress,
+) -> TICC:
+    model = TICC(
+        count,
+        settings.window,
+        settings.sparsity,
+        settings.switch_penalty,
+        max_iterations=settings.max_iterations,
+        seed=seed,
+        init=init,
+    )
+    return model.fit(series, times=times, progress=progress)
+
+
+def _silent(description: str, done: int, total: int) -> None:
+    """Report nothing."""
 
 
 def silhouette(model: TICC, rows: Rows, sample: NDArray[np.int64]) -> float:
@@ -97,7 +132,7 @@ def bic(model: TICC, rows: Rows) -> float:
     used = np.unique(labels)
     width = rows.values.shape[1]
     standard = Rows((rows.values - model.center_) / model.scale_, rows.lengths)
-    scores = score_table(stack_windows(standard, model.window), model.means_, model.precisions_, 0.0)
+    scores = score_table(stack_windows(standard, model.window), model.means_, model.precisions_)
     likelihood = float(scores[np.arange(len(labels)), labels].sum())
     first = model.precisions_[used][:, :width]  # the first block row holds every block once
     diagonal = np.triu(np.ones((width, width), dtype=np.bool_))

@@ -107,15 +107,14 @@ def stack_windows(rows: Rows, window: int) -> Floats:
 def switch_penalties(rows: Rows, penalty: float, times: Sequence[ArrayLike] | None) -> Floats:
     """Return the (n,) cost of a switch between each row and the row before it (MT-TICC).
 
-    With times it is `penalty / log(e + dt)`, dt being the time since the previous row: after a long gap a switch
-    is cheaper. Without times the divisor is 1 and the cost is exactly `penalty`, as in TICC. The entry of a
-    series' first row is not used.
+    It is `penalty / log(e + dt)`, dt being the time since the previous row: after a long gap a switch is cheaper.
+    Without times dt is 1, the same as times 0, 1, 2, ... The entry of a series' first row is not used.
 
     Raises:
         InvalidDataError: times that do not match the series, are not finite, or decrease.
     """
     if times is None:
-        return np.full(len(rows.values), float(penalty))
+        return np.full(len(rows.values), penalty / np.log(np.e + 1))
     if len(times) != len(rows.lengths):
         raise InvalidDataError(f"Got times for {len(times)} series, but there are {len(rows.lengths)} series.")
     gaps = [_gaps(item, index, int(rows.lengths[index])) for index, item in enumerate(times)]

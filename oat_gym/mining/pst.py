@@ -26,12 +26,16 @@ class MiningConfig:
         n_clusters: the number of labels C, or `"auto"`: the best of `candidates` by `criterion`.
         candidates: the values of C that `"auto"` tries (the paper: 10 to 20).
         criterion: `"silhouette"` (the paper) or `"bic"`: -2 log-likelihood + non-zero parameters * log n.
+        restarts: k-means starts from which `"auto"` fits each candidate. The silhouette is their mean; of the candidates
+            that are not significantly worse than the best, the one with the fewest clusters wins.
         window: rows in a TICC window. sparsity, switch_penalty, max_iterations, init: see `TICC`.
         length: W, the length of a PST, or `"auto"`: the largest W whose best support is at least `auto_share` * N.
         auto_share: see `length`.
         min_support: the threshold xi of Definition 2.2: a count (int), a share of the sequences (float in (0, 1]), or
             None for no threshold.
         top: keep the `top` sets of best support (the paper uses 1), or None for all (then give `min_support`).
+        distinct: leave out a set when more than half of its windows overlap those of better sets. A window moved by
+            one row usually has the same support, so that without this the best few sets are one set over and over.
         aligned: count a window as the same only at the same position of its sequence.
 
     Raises:
@@ -44,6 +48,7 @@ class MiningConfig:
     n_clusters: int | Literal["auto"] = 10
     candidates: tuple[int, ...] = tuple(range(10, 21))
     criterion: Literal["silhouette", "bic"] = "silhouette"
+    restarts: int = 3
     window: int = 1
     sparsity: float = 0.11
     switch_penalty: float = 100.0
@@ -53,11 +58,14 @@ class MiningConfig:
     auto_share: float = 0.9
     min_support: float | None = None
     top: int | None = 1
+    distinct: bool = True
     aligned: bool = False
 
     def __post_init__(self) -> None:
         if self.criterion not in ("silhouette", "bic"):
             raise ConfigurationError(f'criterion must be "silhouette" or "bic", got {self.criterion!r}.')
+        if isinstance(self.restarts, bool) or not isinstance(self.restarts, int) or self.restarts < 1:
+            raise ConfigurationError(f"restarts must be a positive integer, got {self.restarts!r}.")
         if len(self.candidates) == 0:
             raise ConfigurationError("candidates is empty; give at least one number of clusters.")
         for count in self.candidates if self.n_clusters == "auto" else (self.n_clusters,):
@@ -232,7 +240,7 @@ def mine(
         length=length,
         supports=np.sort(table.support)[::-1].copy(),
         support_curve=dict(sorted(curve.items())),
-        sets=select_sets(labels, table, min_support=xi, top=config.top),
+        sets=select_sets(labels, table, min_support=xi, top=config.top, distinct=config.distinct),
         n_too_short=int((table.lengths < length).sum()),
         min_support=xi,
     )
@@ -249,22 +257,42 @@ def check_long_enough(series: Sequence[ArrayLike], config: MiningConfig) -> None
     )
 
 
-def select_sets(labels: Sequence[Ints], table: TDSSTable, *, min_support: int, top: int | None) -> tuple[PSTSet, ...]:
-    """Return the PST sets of support >= `min_support`, at most `top` of them, in the order of `MiningResult.sets`."""
+def select_sets(
+    labels: Sequence[Ints], table: TDSSTable, *, min_support: int, top: int | None, distinct: bool = False
+) -> tuple[PSTSet, ...]:
+    """Return the PST sets of support >= `min_support`, at most `top` of them, in the order of `MiningResult.sets`.
+
+    `distinct` leaves out sets that mostly overlap better ones (see `MiningConfig`).
+    """
     cut = min_support
-    if top is not None and len(table.support) > top:
+    if top is not None and len(table.support) > top and not distinct:
         cut = max(cut, int(np.partition(table.support, -top)[-top]))
     entries = np.flatnonzero(table.support >= cut)
     if len(entries) == 0:
         return ()
     windows = np.stack([labels[i][start : start + table.length] for i, start in table.first[entries]])
+    sets: list[PSTSet] = []
+    covered = [np.zeros(len(sequence), dtype=np.bool_) for sequence in labels]
+    for k in _order(table, entries, windows):
+        if top is not None and len(sets) == top:
+            break
+        candidate = _pst_set(table, int(entries[k]), windows[k])
+        spans = [covered[i][start : start + table.length] for i, start in candidate.occurrences]
+        if not distinct or 2 * sum(bool(span.any()) for span in spans) <= len(spans):
+            sets.append(candidate)
+            for span in spans:
+                span[:] = True
+    return tuple(sets)
+
+
+def _order(table: TDSSTable, entries: Ints, windows: Ints) -> Ints:
+    """Return the entries' order: support, more label switches, fewer occurrences, earliest start, labels."""
     position = np.arange(len(table.ids)) - np.repeat(np.cumsum(table.lengths) - table.lengths, table.lengths)
     earliest = np.full(len(table.support), np.iinfo(np.int64).max)
     np.minimum.at(earliest, table.ids[table.ids >= 0], position[table.ids >= 0])
     switches = (np.diff(windows, axis=1) != 0).sum(axis=1)
     keys = [-table.support[entries], -switches, table.occurrences[entries], earliest[entries], *windows.T]
-    order = np.lexsort(keys[::-1])[:top]
-    return tuple(_pst_set(table, int(entries[k]), windows[k]) for k in order)
+    return np.lexsort(keys[::-1])
 
 
 def _pst_set(table: TDSSTable, entry: int, window: Ints) -> PSTSet:

@@ -28,16 +28,14 @@ class TICC:
     sparse and block-Toeplitz: the relation of two features depends on their lag only. All series share the clusters;
     no window and no penalty crosses from one series to the next.
 
-    **Objective**, higher is better. With windows x_t, labels k_t and clusters (mu_c, Theta_c)::
+    **Objective** (the paper's Eq. 2), higher is better. With windows x_t, labels k_t and clusters (mu_c, Theta_c)::
 
-        J = sum_t [ log N(x_t; mu_{k_t}, Theta_{k_t}^-1) - sparsity / 2 * ||Theta_{k_t}||_1 ]
-            - sum over switches at t of  switch_penalty / log(e + dt_t)
+        J = sum_t log N(x_t; mu_{k_t}, Theta_{k_t}^-1) - sum over switches at t of switch_penalty / log(e + dt_t)
 
-    ||.||_1 is the sum of absolute entries, diagonal included. The sparsity term is paid once a row: this is the
-    graphical lasso of the original TICC, whose lambda is not divided by the size of the cluster. Both EM steps
-    maximise J: the graphical lasso over the clusters, Viterbi (with the same penalised scores) over the labels. dt is
-    the time since the previous row; without times the divisor is 1 and a switch costs exactly `switch_penalty`.
-    ADMM is approximate, so an update that would lower J is discarded: `objectives_` never falls.
+    dt is the time since the previous row, 1 where the data has no times. Viterbi gives the labels that maximise J.
+    The clusters maximise, each over its own rows, the likelihood less `sparsity / 2 * ||Theta_c||_1` a row: the
+    graphical lasso of the original TICC, whose lambda is not divided by the size of the cluster and includes the
+    diagonal. That step need not raise J, so an iteration that would lower it is discarded: `objectives_` never falls.
 
     An empty cluster is given the rows that are explained worst, if that raises J. Otherwise it stays empty: then its
     label does not occur in `labels_`.
@@ -179,7 +177,7 @@ class TICC:
         rows = self._standardised(raw)
         with threadpool_limits(limits=1):
             problem = self._problem(rows, times)
-            scores = score_table(problem.windows, self.means_, self.precisions_, self.sparsity)
+            scores = score_table(problem.windows, self.means_, self.precisions_)
         labels, _ = viterbi(scores, problem.penalties, problem.starts)
         return rows.split(labels)
 

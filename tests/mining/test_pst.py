@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -90,7 +92,7 @@ def test_auto_length_is_the_longest_with_enough_support():
 
 @pytest.mark.parametrize("criterion", ["silhouette", "bic"])
 def test_auto_clusters_finds_the_planted_number(criterion):
-    result = run(regimes(), n_clusters="auto", candidates=(2, 3, 5, 7), criterion=criterion)
+    result = run(regimes(n=12), n_clusters="auto", candidates=(2, 3, 5, 7), criterion=criterion, switch_penalty=20.0)
     assert result.n_clusters == 3
     assert list(result.criterion_scores) == [2, 3, 5, 7]
     assert criterion in repr(result)
@@ -165,10 +167,25 @@ def test_door_demonstrations(shared_data):
 
 
 @pytest.mark.shared_data
-def test_silhouette_chooses_among_candidates_on_door_demonstrations(shared_data):
+def test_ten_clusters_by_silhouette_on_the_door_demonstrations(shared_data):
+    """The paper's own value for door-human (appendix B.2)."""
     data = np.load(shared_data / "robotics" / "adroit_human" / "door_human_25demos.npz")
     series = np.split(data["observations"], np.cumsum(data["lengths"])[:-1])
-    config = MiningConfig(n_clusters="auto", candidates=(10, 20), init="kmeans")
+    config = MiningConfig(n_clusters="auto", candidates=tuple(range(10, 21, 2)), init="kmeans")
     result = mine(series, config=config, rng=np.random.default_rng(0))
     assert result.n_clusters == 10
-    assert result.criterion_scores[10] > result.criterion_scores[20]
+    assert result.sets[0].support == 25
+
+
+def test_distinct_sets_are_not_one_set_moved_by_a_row():
+    sequence = np.repeat([0, 1, 2, 3], 10)
+    labels = [sequence.copy() for _ in range(5)]
+    table = count_tdss(labels, 8, aligned=False)
+    literal = select_sets(labels, table, min_support=1, top=3)
+    assert [item.support for item in literal] == [5, 5, 5]
+    assert all(abs(a.occurrences[0, 1] - b.occurrences[0, 1]) < 8 for a, b in pairwise(literal))
+    distinct = select_sets(labels, table, min_support=1, top=3, distinct=True)
+    assert distinct[0].labels == literal[0].labels
+    starts = sorted(int(item.occurrences[0, 1]) for item in distinct)
+    assert len(starts) == 3
+    assert all(b - a >= 8 for a, b in pairwise(starts))

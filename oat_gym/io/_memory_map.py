@@ -1,0 +1,129 @@
+"""Columns on disk, memory-mapped: one flat file a column, found again by the content of the dataset.
+
+A folder holds one sub-folder for each content; it is written under another name and moved into place, so it is complete
+or absent. On opening, every file is checked against its digest; a damaged set is written again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from filelock import FileLock
+from minari import MinariDataset
+
+from oat_gym.cache import fingerprint, write_atomically
+from oat_gym.io._columns import Columns, Layout, assemble, hash_parts, read_parts, write_columns
+
+VERSION = 1
+MANIFEST = "manifest.json"
+
+_log = logging.getLogger(__name__)
+
+
+def columns_on_disk(data: MinariDataset, layout: Layout, folder: Path) -> Columns:
+    """Return the memory-mapped columns of a dataset, writing them first where `folder` does not have them.
+
+    The files are opened copy-on-write: nothing that is done to a batch or a column reaches the disk.
+
+    Raises:
+        OSError: if the folder cannot be written, or the disk is full; nothing incomplete stays under its final name.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    key = fingerprint(
+        torch_columns=VERSION,
+        content=hash_parts(read_parts(data)),
+        spaces=[repr(layout.observation_space), repr(layout.action_space)],
+        flat=layout.flat,
+        dtype=str(layout.dtype),
+    )
+    target = folder / key
+    with FileLock(folder / f".{key}.lock"):
+        columns = _open(target, layout)
+        if columns is None:
+            _write(data, layout, target)
+            columns = _open(target, layout)
+    if columns is None:
+        raise OSError(f"The columns written to {target} did not read back as they were written: check the disk.")
+    return columns
+
+
+class _Files:
+    """One open file a column, with what its manifest entry needs."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._open: dict[str, IO[bytes]] = {}
+        self._digests: dict[str, Any] = {}
+        self.entries: dict[str, dict[str, Any]] = {}
+
+    def append(self, name: str, rows: npt.NDArray[Any]) -> None:
+        if name not in self._open:
+            self._open[name] = (self._folder / f"{len(self._open):03d}.bin").open("wb")
+            self._digests[name] = hashlib.sha256()
+            self.entries[name] = {"dtype": rows.dtype.str, "shape": [0, *rows.shape[1:]]}
+        data = np.ascontiguousarray(rows).data
+        self._open[name].write(data)
+        self._digests[name].update(data)
+        self.entries[name]["shape"][0] += len(rows)
+
+    def close(self) -> None:
+        for name, file in self._open.items():
+            self.entries[name]["sha256"] = self._digests[name].hexdigest()
+            with file:
+                file.flush()
+                os.fsync(file.fileno())
+
+
+def _write(data: MinariDataset, layout: Layout, target: Path) -> None:
+    # One name a content: what a killed process left there is taken away by the next one, under the lock.
+    partial = target.with_name(f".{target.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    files = _Files(partial)
+    try:
+        try:
+            lengths = write_columns(read_parts(data), layout, files.append)
+        finally:
+            files.close()
+        manifest = {"version": VERSION, "columns": files.entries, "lengths": lengths.tolist()}
+        write_atomically(partial / MANIFEST, json.dumps(manifest).encode())
+        partial.rename(target)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _open(target: Path, layout: Layout) -> Columns | None:
+    if not target.exists():
+        return None
+    try:
+        manifest = json.loads((target / MANIFEST).read_text())
+        columns = {
+            name: _map(target, number, entry) for number, (name, entry) in enumerate(manifest["columns"].items())
+        }
+        return assemble(columns, layout, np.asarray(manifest["lengths"], dtype=np.int64))
+    except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
+        _log.warning("The columns at %s are damaged (%s): they are written again.", target, error)
+        shutil.rmtree(target)
+        return None
+
+
+def _map(folder: Path, number: int, entry: dict[str, Any]) -> torch.Tensor:
+    path = folder / f"{number:03d}.bin"  # never a name from the manifest
+    with path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != entry["sha256"]:
+        raise ValueError(f"{path.name} does not match its digest")
+    shape = tuple(entry["shape"])
+    if 0 in shape:
+        return torch.from_numpy(np.zeros(shape, dtype=entry["dtype"]))
+    return torch.from_numpy(np.asarray(np.memmap(path, dtype=entry["dtype"], mode="c", shape=shape)))
