@@ -118,7 +118,7 @@ def new_dataset_folder(dataset_id: str) -> Generator[Path]:
 def _publish(folder: Path, path: Path, dataset_id: str) -> None:
     check_dataset_id(dataset_id)
     try:
-        _make_namespaces(path)
+        _make_namespaces(path, folder.parent)
         folder.rename(path)
     except OSError as error:
         raise (_exists_error(dataset_id, path) if path.exists() else _save_error(dataset_id, error)) from error
@@ -282,12 +282,13 @@ def _namespaces(path: Path) -> list[Path]:
     return [parent for parent in path.resolve().parents if parent.is_relative_to(root) and parent != root]
 
 
-def _make_namespaces(path: Path) -> None:
+def _make_namespaces(path: Path, staging: Path) -> None:
     """Make them as Minari does, but so that neither a kill nor another process at the same work can spoil them."""
     for folder in _namespaces(path):
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / NAMESPACE_METADATA_FILENAME).exists():
-            write_atomically(folder / NAMESPACE_METADATA_FILENAME, b"{}")
+            (staging / NAMESPACE_METADATA_FILENAME).write_bytes(b"{}")
+            (staging / NAMESPACE_METADATA_FILENAME).replace(folder / NAMESPACE_METADATA_FILENAME)
 
 
 def _exists_error(dataset_id: str, path: Path) -> DatasetExistsError:

@@ -36,6 +36,7 @@ EPISODE_METADATA_FILE = "episode_metadata.json"
 LIVE_RECIPE = {"live": True}
 """Stands in a temporary directory, which is of use only to the process that made it."""
 
+_MAX_CHAIN = 16
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _METADATA_TYPES = {
     "total_episodes": int,
@@ -89,8 +90,6 @@ def _load(name: str, data_path: pathlib.Path) -> MinariDataset:
         return minari.load_dataset(name)
     except OatGymError:
         raise
-    except RecursionError as error:
-        raise InvalidDataError(f"The dataset {name!r} is its own source, directly or through others.") from error
     except _DAMAGE as error:
         raise InvalidDataError(
             f"The dataset {name!r} at {data_path} cannot be opened ({type(error).__name__}: {error}). Restore it, or "
@@ -179,6 +178,7 @@ def _plan_of(recipe: dict[str, Any], path: pathlib.Path) -> Synthesis:
     if not isinstance(origin["content"], str) or not _SHA256.fullmatch(origin["content"]):
         raise InvalidDataError(f"{path} gives {origin['content']!r} for the SHA-256 of its source's content.")
     augmenter = config_from_json(AUGMENTERS[name], recipe["augmenter"]["settings"])
+    _check_chain(path)
     dataset, episodes = find_dataset(origin["id"]), origin["episodes"]
     if episodes is not None:
         total = dataset.storage.total_episodes
@@ -187,6 +187,27 @@ def _plan_of(recipe: dict[str, Any], path: pathlib.Path) -> Synthesis:
         dataset = MinariDataset(dataset.storage, episode_indices=np.array(episodes, dtype=np.int64))
     source = Source(dataset, expected_fingerprint=origin["content"])
     return Synthesis(source, augmenter, count=recipe["count"], seed=recipe["seed"])
+
+
+def _check_chain(path: pathlib.Path) -> None:
+    """Follow a recipe to its source, the source of that and so on, as long as they are recipes."""
+    seen = [path.resolve()]
+    while (following := _recipe_of_source(seen[-1])) is not None:
+        if following in seen or len(seen) == _MAX_CHAIN:
+            raise InvalidDataError(
+                f"{path} is its own source, directly or through others, or has over {_MAX_CHAIN} recipes behind it."
+            )
+        seen.append(following)
+
+
+def _recipe_of_source(path: pathlib.Path) -> pathlib.Path | None:
+    origin = read_json(path)["source"]["id"]
+    try:
+        parse_dataset_id(origin)
+        following = get_dataset_path(origin) / "data" / RECIPE_FILE
+        return following.resolve() if following.exists() else None
+    except (OSError, TypeError, ValueError):  # find_dataset says what is wrong with it
+        return None
 
 
 def check_folder(data_path: pathlib.Path) -> None:
@@ -261,20 +282,20 @@ def _check_edits(path: pathlib.Path, total: int) -> None:
 
 
 def _check_hdf5(path: pathlib.Path) -> None:
-    def check(name: str, link: Any) -> None:
+    def elsewhere(name: str, link: Any) -> str | None:
+        """Return the name of what is not in the file itself; h5py stops there."""
         if not isinstance(link, h5py.HardLink):
-            raise InvalidDataError(f"{path} holds a link to other data at {name!r}, which no Minari file does.")
+            return name
         part = file[name]
-        if isinstance(part, h5py.Dataset) and (part.external or part.is_virtual):
-            raise InvalidDataError(f"{path} keeps {name!r} in another file, which no Minari file does.")
+        return name if isinstance(part, h5py.Dataset) and (part.external or part.is_virtual) else None
 
     try:
         with h5py.File(path, "r") as file:
-            file.visititems_links(check)
-    except OatGymError:
-        raise
+            found = file.visititems_links(elsewhere)
     except _DAMAGE as error:
         raise InvalidDataError(f"{path} is damaged: {error}") from error
+    if found is not None:
+        raise InvalidDataError(f"{path} takes {found!r} from elsewhere by a link, which no Minari file does.")
 
 
 def _check_spaces(data_path: pathlib.Path, source: Source) -> None:

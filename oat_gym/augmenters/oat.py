@@ -139,7 +139,7 @@ class OAT(Augmenter):
             rng=derive(seed, "model"),
             progress=progress,
         )
-        return OATSampler(self, source, seed, mining, behavior, tuple(models))
+        return OATSampler(self, source, seed, mining=mining, behavior=behavior, models=tuple(models))
 
     def mine(self, dataset: MinariDataset, *, seed: int = 0, progress: ProgressCallback = silent) -> MiningResult:
         """Mine a dataset and train nothing: what `AugmentedDataset.mining` would be with this seed.
@@ -165,7 +165,7 @@ class OAT(Augmenter):
             FittedVAEMDP.from_arrays(_with_prefix(arrays, f"model{g}/"), config=self.model, name=f"PST set {g}")
             for g in range(len(mining.sets))
         ]
-        return OATSampler(self, source, seed, mining, behavior, tuple(models))
+        return OATSampler(self, source, seed, mining=mining, behavior=behavior, models=tuple(models))
 
 
 class OATSampler(Sampler):
@@ -176,6 +176,7 @@ class OATSampler(Sampler):
         config: OAT,
         source: Source,
         seed: int,
+        *,
         mining: MiningResult,
         behavior: BehaviorModel,
         models: tuple[FittedVAEMDP, ...],

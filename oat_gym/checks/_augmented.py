@@ -236,16 +236,17 @@ def _source_number(number: int, dataset: AugmentedDataset) -> int:
 
 
 READ = ("readable", "ids", "determinism", "t-plus-one")
+CONTENT = ("dtypes", "shapes", "spaces", "finite", "flags", "total-steps")
 AUGMENTED_CHECKS: tuple[Check[Subject], ...] = (
     Check("plan", "real, synthetic and appended episodes add up", plan),
     Check("real-episodes", "real episodes are the source's to the last bit", real_episodes, (*READ, "plan")),
-    Check("provenance", "provenance is consistent with the metadata", provenance, (*READ, "plan")),
+    Check("provenance", "provenance is that of the metadata", provenance, (*READ, "plan", "metadata-steps")),
     Check("masks", "a mask has one boolean for each step", masks, (*READ, "plan")),
     Check("outside-spans", "outside its spans an episode is its source", outside_spans, (*READ, "masks", "provenance")),
     Check("infos-kept", "infos keep the source's schema", infos_kept, (*READ, "plan")),
     Check("metadata-kept", "episode metadata survives", metadata_kept, (*READ, "plan")),
     Check("environment", "spaces, environments and scores are the source's", environment),
-    Check("transitions", "transitions keep the T+1 rule", transitions, (*READ, "masks")),
+    Check("transitions", "transitions keep the T+1 rule", transitions, (*READ, "masks", *CONTENT)),
     Check("rebuilding", "the plan gives the same bytes again", rebuilding, (*READ, "plan")),
 )
 UNTOUCHED: Check[Subject] = Check("source-untouched", "the source is never written to", source_untouched)

@@ -6,6 +6,7 @@ Both libraries are optional: neither is a dependency, and each is imported when 
 from __future__ import annotations
 
 import importlib
+import logging
 from types import ModuleType
 from typing import Any
 
@@ -23,6 +24,8 @@ from oat_gym.recipe import find_dataset
 from oat_gym.spaces import Batch, FlatSpace, map_tree
 
 FLOAT32 = np.dtype(np.float32)
+
+_log = logging.getLogger(__name__)
 
 
 def to_torchrl(
@@ -78,16 +81,17 @@ def to_torchrl(
 
 
 def to_d3rlpy(data: MinariDataset | str) -> Any:
-    """Return a `d3rlpy.dataset.MDPDataset` of a Minari dataset, augmented or not: one d3rlpy episode for each of ours.
+    """Return a `d3rlpy.dataset.MDPDataset` of a Minari dataset, augmented or not: an episode for each of ours.
 
     Use it in place of d3rlpy's `get_minari`, which in version 2.8 joins T+1 observations of an episode to T actions, so
     that from the second episode on observations belong to other rows.
 
     Row t of an episode is (observations[t], actions[t], rewards[t]); `terminals` are terminations, `timeouts` the
     truncations of the last step. The format has no place for the last observation, so d3rlpy does not sample the last
-    transition of an episode that was truncated. An episode whose last step has neither flag ends in a timeout (d3rlpy
-    would drop or join it); one with both is terminal. Box observations keep their shape, others become one float
-    matrix (`oat_gym.spaces.FlatSpace`); discrete actions are counted from 0; floating-point values are float32.
+    transition of a truncated episode, and leaves out a truncated episode of one step (the log says how many). An
+    episode whose last step has neither flag ends in a timeout (d3rlpy would drop or join it); one with both is
+    terminal. Box observations keep their shape, others become one float matrix (`oat_gym.spaces.FlatSpace`); discrete
+    actions are counted from 0; floating-point values are float32.
 
     Raises:
         ImportError: if d3rlpy is not installed.
@@ -102,6 +106,9 @@ def to_d3rlpy(data: MinariDataset | str) -> Any:
     steps = {name: column[:-1].numpy() for name, column in columns.steps.items()}
     _check_contiguous(steps)
     terminals, timeouts = _d3rlpy_ends(columns, steps)
+    dropped = int((timeouts & (steps["step"] == 0)).sum())
+    if dropped:
+        _log.warning("d3rlpy leaves out %d truncated episodes of one step: it has no next state for them.", dropped)
     actions, size = _d3rlpy_actions(columns.actions, data.action_space)
     discrete = isinstance(data.action_space, spaces.Discrete)
     return dataset.MDPDataset(

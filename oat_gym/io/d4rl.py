@@ -10,10 +10,18 @@ The layout has one row a step: `observations`, `actions`, `rewards`, `terminals`
 kept, truncated. A file of `write_d4rl` is cut where it was written, unless `cut_at` or `max_episode_steps` is given:
 then its rows are read like any other file's, without the infos of resets and the metadata of episodes.
 
-**The last observation** of an episode is its last `next_observations`. Without that key, an episode that ends in a
-terminal repeats its last observation (nothing is estimated beyond a terminal). Any other loses its last step, whose
-outcome is unknown: the step before is then the truncated one, and an episode of one row is left out. The dataset's
-metadata counts both under "d4rl" (`repeated_observations`, `dropped_steps`) and keeps `metadata/*` there.
+**The last observation** of an episode is its last `next_observations`, taken as given (`qlearning_dataset` puts the
+next episode's first observation there at a terminal; no estimator looks at it, models of states do). Without that key,
+an episode that ends in a terminal repeats its last observation (nothing is estimated beyond a terminal). Any other
+loses its last step, whose outcome is unknown: the step before is then the truncated one, and an episode of one row is
+left out. The dataset's metadata counts both under "d4rl" (`repeated_observations`, `dropped_steps`) and keeps
+`metadata/*` there.
+
+>>> observations = np.array([[0.0], [1.0], [5.0], [6.0], [7.0]])
+>>> rows = {"observations": observations, "actions": np.zeros((5, 1)), "rewards": np.arange(5.0)}
+>>> data = read_d4rl({**rows, "terminals": np.array([0, 1, 0, 0, 0]), "timeouts": np.array([0, 0, 0, 0, 1])})
+>>> [episode.observations.ravel().tolist() for episode in data]
+[[0.0, 1.0, 1.0], [5.0, 6.0, 7.0]]
 """
 
 from __future__ import annotations
@@ -125,12 +133,6 @@ def read_d4rl(
         ConfigurationError: where nothing says where episodes end, or which whole numbers an action may be.
         UnsupportedSpaceError: for spaces that are not one array a step.
         DatasetExistsError, CacheError: if there is a dataset of this id, or the cache cannot store it.
-
-    >>> observations = np.array([[0.0], [1.0], [5.0], [6.0], [7.0]])
-    >>> rows = {"observations": observations, "actions": np.zeros((5, 1)), "rewards": np.arange(5.0)}
-    >>> data = read_d4rl({**rows, "terminals": np.array([0, 1, 0, 0, 0]), "timeouts": np.array([0, 0, 0, 0, 1])})
-    >>> [episode.observations.ravel().tolist() for episode in data]
-    [[0.0, 1.0, 1.0], [5.0, 6.0, 7.0]]
     """
     path = None if isinstance(source, Mapping) else Path(source)
     flat = flatten_mapping(source) if isinstance(source, Mapping) else read_flat(Path(source))
@@ -143,15 +145,7 @@ def read_d4rl(
         action_space=action_space,
         file=None if path is None else path.name,
     )
-    if dataset_id is None:
-        key = fingerprint(
-            kind="d4rl", version=VERSION, minari=minari.__version__, data=_hash(flat), **reading.options()
-        )
-        return cached_dataset(key, lambda folder: _convert(flat, reading, folder))
-    target = check_dataset_id(dataset_id)
-    with new_dataset_folder(dataset_id) as folder:
-        _convert(flat, reading, folder)
-    return MinariDataset(target / "data")
+    return _store(flat, reading, named=dataset_id is not None)
 
 
 def write_d4rl(data: MinariDataset, path: str | os.PathLike[str]) -> Path:
@@ -222,6 +216,18 @@ def _hash(flat: Flat) -> str:
         else:
             digest.update(f"|{name}|{value!r}|".encode())
     return digest.hexdigest()
+
+
+def _store(flat: Flat, reading: _Reading, *, named: bool) -> MinariDataset:
+    if not named:
+        key = fingerprint(
+            kind="d4rl", version=VERSION, minari=minari.__version__, data=_hash(flat), **reading.options()
+        )
+        return cached_dataset(key, lambda folder: _convert(flat, reading, folder))
+    target = check_dataset_id(reading.dataset_id)
+    with new_dataset_folder(reading.dataset_id) as folder:
+        _convert(flat, reading, folder)
+    return MinariDataset(target / "data")
 
 
 def _convert(flat: Flat, reading: _Reading, folder: Path) -> None:

@@ -89,12 +89,10 @@ def to_torch(
         raise ConfigurationError(f"to_torch reads a Minari dataset or the id of one, got {data!r}.")
     layout = Layout(data.observation_space, data.action_space, flat, None if dtype is None else DTYPES[dtype])
     layout.check()
-    if memory_map is None:
-        columns = columns_in_memory(data, layout)
-    else:
-        columns = columns_on_disk(data, layout, Path(memory_map))
+    on_disk = memory_map is not None
+    columns = columns_on_disk(data, layout, Path(memory_map)) if on_disk else columns_in_memory(data, layout)
     return TorchLoader(
-        columns, config, device=target, pin_memory=pin_memory, keep_on_device=memory_map is None and not pin_memory
+        columns, config, device=target, pin_memory=pin_memory, keep_on_device=not on_disk and not pin_memory
     )
 
 

@@ -54,22 +54,31 @@ def choose_clusters(
     """
     seeds = [int(seed) for seed in rng.integers(2**31, size=settings.restarts)]
     report: Progress = progress or _silent
+
+    def fit(count: int, seed: int, init: Initialisation, report: Progress) -> TICC:
+        return _fit(series, count, settings, seed=seed, times=times, init=init, progress=report)
+
     if len(candidates) == 1:
-        return _fit(series, candidates[0], settings, seeds[0], times, settings.init, report), {}
+        return fit(candidates[0], seeds[0], settings.init, report), {}
     rows = join_series(series)
     sample = np.sort(rng.permutation(len(rows.values))[:_SILHOUETTE_ROWS])
-    found: dict[int, list[float]] = {}
+    models: dict[int, list[TICC]] = {}
+    scores: dict[int, list[float]] = {}
     for number, count in enumerate(candidates):
         report("choosing the number of clusters", number, len(candidates))
-        models = (_fit(series, count, settings, seed, times, "kmeans", _silent) for seed in seeds)
+        models[count] = [fit(count, seed, "kmeans", _silent) for seed in seeds]
         with threadpool_limits(limits=1):
-            found[count] = [silhouette(m, rows, sample) if criterion == "silhouette" else bic(m, rows) for m in models]
+            scores[count] = [
+                silhouette(model, rows, sample) if criterion == "silhouette" else bic(model, rows)
+                for model in models[count]
+            ]
     report("choosing the number of clusters", len(candidates), len(candidates))
-    chosen = fewest_not_worse(found) if criterion == "silhouette" else min(found, key=lambda c: min(found[c]))
-    inits = [*(("kmeans", seed) for seed in seeds), *([("gmm", seeds[0])] if settings.init != "kmeans" else [])]
-    final = [_fit(series, chosen, settings, seed, times, init, report) for init, seed in inits]
+    chosen = fewest_not_worse(scores) if criterion == "silhouette" else min(scores, key=lambda c: min(scores[c]))
+    final = [] if settings.init == "gmm" else models[chosen]
+    if settings.init != "kmeans":
+        final = [*final, fit(chosen, seeds[0], "gmm", report)]
     summary = np.mean if criterion == "silhouette" else np.min
-    return max(final, key=lambda model: model.objective_), {c: float(summary(found[c])) for c in candidates}
+    return max(final, key=lambda model: model.objective_), {c: float(summary(scores[c])) for c in candidates}
 
 
 def fewest_not_worse(scores: Mapping[int, Sequence[float]]) -> int:
@@ -92,6 +101,7 @@ def _fit(
     series: Sequence[ArrayLike],
     count: int,
     settings: TICCSettings,
+    *,
     seed: int,
     times: Sequence[ArrayLike] | None,
     init: Initialisation,
@@ -125,17 +135,16 @@ def silhouette(model: TICC, rows: Rows, sample: NDArray[np.int64]) -> float:
 def bic(model: TICC, rows: Rows) -> float:
     """Return -2 log-likelihood + (number of non-zero parameters) * log n; lower is better.
 
-    Parameters are the means, and of each precision the distinct entries of its Toeplitz blocks, for the clusters
-    that occur. The log-likelihood is without the penalties.
+    Parameters are the means, and of each precision the distinct entries of its Toeplitz blocks; those of a cluster
+    that stayed empty count too, so that it does not come free. The log-likelihood is without the penalties.
     """
     labels = np.concatenate(model.labels_)
-    used = np.unique(labels)
     width = rows.values.shape[1]
     standard = Rows((rows.values - model.center_) / model.scale_, rows.lengths)
     scores = score_table(stack_windows(standard, model.window), model.means_, model.precisions_)
     likelihood = float(scores[np.arange(len(labels)), labels].sum())
-    first = model.precisions_[used][:, :width]  # the first block row holds every block once
+    first = model.precisions_[:, :width]  # the first block row holds every block once
     diagonal = np.triu(np.ones((width, width), dtype=np.bool_))
     count = int((first[:, :, :width] != 0)[:, diagonal].sum() + (first[:, :, width:] != 0).sum())
-    count += int((model.means_[used] != 0).sum())
+    count += int((model.means_ != 0).sum())
     return -2 * likelihood + count * float(np.log(len(labels)))

@@ -26,8 +26,8 @@ class MiningConfig:
         n_clusters: the number of labels C, or `"auto"`: the best of `candidates` by `criterion`.
         candidates: the values of C that `"auto"` tries (the paper: 10 to 20).
         criterion: `"silhouette"` (the paper) or `"bic"`: -2 log-likelihood + non-zero parameters * log n.
-        restarts: k-means starts from which `"auto"` fits each candidate. The silhouette is their mean; of the candidates
-            that are not significantly worse than the best, the one with the fewest clusters wins.
+        restarts: k-means starts from which `"auto"` fits each candidate. The silhouette is their mean; of the
+            candidates that are not significantly worse than the best, the one with the fewest clusters wins.
         window: rows in a TICC window. sparsity, switch_penalty, max_iterations, init: see `TICC`.
         length: W, the length of a PST, or `"auto"`: the largest W whose best support is at least `auto_share` * N.
         auto_share: see `length`.

@@ -216,7 +216,14 @@ def test_spaces_that_are_not_modelled_are_refused_at_once_but_carried() -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [{"start": "middle"}, {"seam": "none"}, {"actions": "mine"}, {"candidates": 0}, {"features": "x"}, {"features": ()}],
+    [
+        {"start": "middle"},
+        {"seam": "none"},
+        {"actions": "mine"},
+        {"candidates": 0},
+        {"features": "x"},
+        {"features": ()},
+    ],
 )
 def test_bad_settings_are_named(settings: dict[str, object]) -> None:
     with pytest.raises(ConfigurationError, match=next(iter(settings))):

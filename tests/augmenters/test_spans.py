@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 from gymnasium import spaces
 from hypothesis import given
@@ -20,7 +22,7 @@ OCCURRENCES = st.lists(
 def test_spans_never_overlap_and_lie_at_occurrences_of_the_episode(sets: list[np.ndarray], i: int, k: int) -> None:
     placed = place_spans(sets, i, k, WIDTH)
     starts = sorted(start for _, start in placed)
-    assert all(b - a >= WIDTH for a, b in zip(starts, starts[1:], strict=False))
+    assert all(b - a >= WIDTH for a, b in pairwise(starts))
     assert len({g for g, _ in placed}) == len(placed)
     for g, start in placed:
         assert [i, start] in sets[g].tolist()

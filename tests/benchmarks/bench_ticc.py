@@ -92,7 +92,7 @@ def run_ours(
 
 
 def score(x: np.ndarray, result: dict[str, object], window: int, penalty: float, sparsity: float) -> dict[str, float]:
-    """The objective of `TICC` on the full windows (at the peer's penalty), its parts, and that with the sparsity term."""
+    """The objective of `TICC` on the full windows (at the peer's penalty), its parts, and with the sparsity term."""
     labels, means, precisions = (np.asarray(result[k]) for k in ("labels", "means", "precisions"))
     windows = np.concatenate([x[lag : len(x) - window + 1 + lag] for lag in range(window)], axis=1)
     likelihood = size = 0.0

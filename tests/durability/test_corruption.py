@@ -59,13 +59,21 @@ def as_an_ordinary_user() -> Generator[None]:
 
 
 @pytest.fixture
-def items(walk_dataset: minari.MinariDataset, tiny_oat: OAT) -> Iterator[tuple[Callable[[], AugmentedDataset], str]]:
-    """Fit once; give a function that makes the same dataset again, and its digest."""
+def items(
+    walk_dataset: minari.MinariDataset, tiny_oat: OAT, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Callable[[], AugmentedDataset], str]:
+    """Fit once; give a function that makes the same dataset again, and its digest.
+
+    Training again gives what it gave before (the kill harness shows that), at once.
+    """
 
     def make() -> AugmentedDataset:
         return AugmentedDataset(walk_dataset, tiny_oat, factor=3, seed=4)
 
-    yield make, digest(make())
+    data = make()
+    truth, fitted = digest(data), data.synthesis.sampler
+    monkeypatch.setattr(OAT, "fit", lambda *_, **__: fitted)
+    return make, truth
 
 
 def damaged(good: bytes) -> Iterator[tuple[str, bytes]]:
@@ -80,15 +88,10 @@ def damaged(good: bytes) -> Iterator[tuple[str, bytes]]:
 
 
 @pytest.mark.parametrize("name", ["model", "variation-0", "variation-1"])
-def test_a_damaged_cache_file_is_made_again(
-    items: tuple[Callable[[], AugmentedDataset], str], name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_damaged_cache_file_is_made_again(items: tuple[Callable[[], AugmentedDataset], str], name: str) -> None:
     make, truth = items
     path = next(cache_folder().rglob(f"{name}.safetensors"))
     good = path.read_bytes()
-    # Training is replaced by what it gave before (the cache is deterministic), so that many damages can be tried.
-    fitted = make().synthesis.sampler
-    monkeypatch.setattr(OAT, "fit", lambda *_, **__: fitted)
     for what, bad in damaged(good):
         path.write_bytes(bad)
         assert digest(make()) == truth, what
@@ -108,6 +111,7 @@ def test_permissions_that_forbid_reading_are_a_clear_error(
     items: tuple[Callable[[], AugmentedDataset], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = items[0]()
+    assert data.synthesis.cache_key  # reads the source
     with tempfile.TemporaryDirectory() as name:
         folder = shutil.copytree(cache_folder(), Path(name) / "cache")
         monkeypatch.setenv("OAT_GYM_CACHE", str(folder))
