@@ -8,6 +8,7 @@ processes. A plain `torch.utils.data.DataLoader` works too: its batches do not d
 
 import sys
 
+import minari
 import numpy as np
 import torch
 from torch.utils.data import DataLoader
@@ -15,13 +16,13 @@ from torch.utils.data import DataLoader
 import oat_gym
 
 
-def noisy_actions(episode, rng):
+def noisy_actions(episode: minari.EpisodeData, rng: np.random.Generator) -> minari.EpisodeData:
     """Return the episode with a little noise on its actions: a stand-in for a real augmenter such as OAT()."""
     episode.actions[:] = np.clip(episode.actions + 0.05 * rng.normal(size=episode.actions.shape), -1, 1)
     return episode
 
 
-def pad(episodes):
+def pad(episodes: list[minari.EpisodeData]) -> list[torch.Tensor]:
     """Pad the actions and rewards of the episodes of a batch: the collate function of a plain DataLoader."""
     parts = [[torch.as_tensor(getattr(episode, name)) for episode in episodes] for name in ("actions", "rewards")]
     return [torch.nn.utils.rnn.pad_sequence(part, batch_first=True) for part in parts]

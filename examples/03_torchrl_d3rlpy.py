@@ -7,16 +7,19 @@ Both libraries have a Minari reader of their own; TorchRL 0.14's gives zeros and
 against actions from the second episode on, so use these functions instead.
 """
 
+import minari
+import numpy as np
+
 import oat_gym
 
 
-def quieter(episode, rng):
+def quieter(episode: minari.EpisodeData, rng: np.random.Generator) -> minari.EpisodeData:
     """Return the episode with rewards scaled a little: a stand-in for a real augmenter such as OAT()."""
     episode.rewards[:] *= rng.uniform(0.9, 1.0)
     return episode
 
 
-def show_torchrl(data) -> None:
+def show_torchrl(data: minari.MinariDataset) -> None:
     buffer = oat_gym.to_torchrl(data, batch_size=128, flat=True, seed=0)
     sample = buffer.sample()
     print(
@@ -29,7 +32,7 @@ def show_torchrl(data) -> None:
     print("TorchRL: slices of 10 steps of episodes", slices["episode"].unique().tolist())
 
 
-def show_d3rlpy(data) -> None:
+def show_d3rlpy(data: minari.MinariDataset) -> None:
     dataset = oat_gym.to_d3rlpy(data)
     batch = dataset.sample_transition_batch(128)
     print("d3rlpy:", len(dataset.episodes), "episodes; a batch has observations of", batch.observations.shape)

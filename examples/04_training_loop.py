@@ -9,6 +9,7 @@ the embedded Maze2D dataset with an augmenter that needs no training.
 import copy
 import time
 
+import minari
 import numpy as np
 import torch
 from torch import nn
@@ -23,7 +24,7 @@ GAMMA = 0.99
 TAU = 0.05  # step of the target network
 
 
-def jitter(episode, rng):
+def jitter(episode: minari.EpisodeData, rng: np.random.Generator) -> minari.EpisodeData:
     """Return the episode with noise on its observed positions: a stand-in for a real augmenter such as OAT()."""
     states = episode.observations["observation"]
     states += 0.01 * rng.normal(size=states.shape).astype(states.dtype)
@@ -36,6 +37,7 @@ def network(inputs: int, outputs: int) -> nn.Module:
 
 if __name__ == "__main__":
     torch.manual_seed(SEED)
+    torch.set_num_threads(1)  # networks this small run faster so
     data = oat_gym.AugmentedDataset("oat_gym/maze2d-umaze-v0", oat_gym.Function(jitter), factor=2, seed=SEED)
     loader = oat_gym.to_torch(
         data, batch_size=BATCH_SIZE, sampling="replacement", real_fraction=0.5, flat=True, seed=SEED
@@ -70,4 +72,4 @@ if __name__ == "__main__":
     # The value of the behaviour policy where the real episodes start.
     real = oat_gym.to_torch(data.source, kind="episodes", sampling="sequential", batch_size=len(data), flat=True)
     starts = next(iter(real)).observations[:, 0]
-    print(f"mean value of the real initial states: {float(np.mean(critic(starts).detach().numpy())):.3f}")
+    print(f"mean value of the real initial states: {critic(starts).mean().item():.3f}")

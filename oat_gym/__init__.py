@@ -15,6 +15,7 @@ from oat_gym.augmenters import AUGMENTERS, Augmenter, Function
 from oat_gym.augmenters.oat import OAT
 from oat_gym.dataset import AugmentedDataset, augment, install
 from oat_gym.episodes import Transitions
+from oat_gym.io.d4rl import read_d4rl, write_d4rl
 from oat_gym.mining import MiningConfig, MiningResult
 from oat_gym.provenance import Provenance
 from oat_gym.stitching import Span
@@ -37,4 +38,6 @@ __all__ = [
     "augment",
     "domains",
     "mining",
+    "read_d4rl",
+    "write_d4rl",
 ]

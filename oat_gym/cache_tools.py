@@ -17,21 +17,18 @@ from filelock import FileLock, Timeout
 from oat_gym.cache import FORMAT_VERSION, cache_folder
 from oat_gym.errors import CacheError, ConfigurationError
 
-Kind = Literal["fit", "dataset", "domain", "unfinished", "other"]
+Kind = Literal["fit", "dataset", "other"]
 
-_DOMAINS = "domains"
 _DATASET = "dataset"
-_UNFINISHED_SECONDS = 3600.0  # a hidden folder that nobody wrote to for this long was left by a killed process
 
 
 @dataclass(frozen=True)
 class CacheItem:
     """One thing that the cache keeps.
 
-    `kind` is "fit" (mined and trained models), "dataset" (a converted D4RL file), "domain" (a converted dataset of
-    `oat_gym.domains`), "unfinished" (the work of a process that runs, or was killed) or "other". `size` is in bytes;
-    `last_used` is when a file of it was last written or, as far as the disk keeps that, read. `version` is the cache
-    format of an entry, None where the thing has none.
+    `kind` is "fit" (mined and trained models), "dataset" (a conversion to Minari's format) or "other". `size` is in
+    bytes; `last_used` is when a file of it was last written or, as far as the disk keeps that, read. `version` is the
+    cache format of an entry, None where the thing has none.
     """
 
     path: Path
@@ -119,9 +116,6 @@ def _places(root: Path) -> Iterator[tuple[Path, Kind, int | None]]:
             for shard in _folders(top):
                 for path in _folders(shard):
                     yield path, "dataset" if (path / _DATASET).is_dir() else "fit", int(version[1])
-        elif top.name == _DOMAINS:
-            for path in _folders(top):
-                yield path, "unfinished" if path.name.startswith(".") else "domain", None
         else:
             yield top, "other", None
 
@@ -144,14 +138,10 @@ def _item(path: Path, kind: Kind, version: int | None) -> CacheItem | None:
 
 def _remove(item: CacheItem) -> bool:
     try:
-        if item.version is not None:
-            with _lock(item.path) as free:
-                if free:
-                    shutil.rmtree(item.path)
-                return free
-        if item.kind == "unfinished" and time.time() - item.last_used.timestamp() < _UNFINISHED_SECONDS:
-            return False
-        shutil.rmtree(item.path)
+        with _lock(item.path) as free:
+            if free:
+                shutil.rmtree(item.path)
+            return free
     except FileNotFoundError:  # another process cleared it in the meantime
         return True
     except OSError as error:

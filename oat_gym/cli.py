@@ -16,10 +16,10 @@ from rich.console import Console
 from rich.table import Table
 
 import oat_gym
-from oat_gym import domains, plots
+from oat_gym import cache_tools, domains, plots
 from oat_gym.augmenters import AUGMENTERS, Augmenter
 from oat_gym.augmenters.oat import OAT
-from oat_gym.dataset import AugmentedDataset
+from oat_gym.dataset import AugmentedDataset, find_source
 from oat_gym.domains import maze2d
 from oat_gym.errors import ConfigurationError, DatasetExistsError, OatGymError
 from oat_gym.export import DATA_FORMATS, check_dataset_id
@@ -29,6 +29,8 @@ from oat_gym.recipe import find_dataset
 from oat_gym.report import DatasetSummary, GroupSummary, summarize
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False)
+cache_app = typer.Typer(no_args_is_help=True, help="What the cache holds, and emptying it.")
+app.add_typer(cache_app, name="cache")
 out = Console(highlight=False, soft_wrap=True)
 
 DEMO_ID = "maze2d-umaze/oat-v0"
@@ -38,7 +40,7 @@ DEMO_CONFIG = OAT(
 )
 """Three PST sets, as in the paper's Fig. 4, of clusters of places in the maze."""
 
-Dataset = Annotated[str, typer.Argument(help="Id of a local Minari dataset, or a name of oat_gym.domains.DATASETS.")]
+Dataset = Annotated[str, typer.Argument(help="Id of a local Minari dataset, path of a D4RL file, or one of "+ ", ".join(domains.DATASETS) + ".")]
 Method = Annotated[str, typer.Option("--augmenter", help=f"One of {', '.join(AUGMENTERS)}.")]
 Factor = Annotated[float, typer.Option(help="Episodes in all, as a multiple of the source's.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.")]
@@ -143,9 +145,40 @@ def inspect(
         _print_mining(result, len(data))
 
 
+@cache_app.command("list")
+def cache_list() -> None:
+    """List what the cache holds, the longest unused first."""
+    table = Table(box=None, pad_edge=False, header_style="")
+    for column in ("kind", "MB", "last used", "entry"):
+        table.add_column(column, justify="right" if column == "MB" else "left")
+    items = cache_tools.list_entries()
+    for item in items:
+        kind = item.kind if item.is_current else f"{item.kind} (format {item.version}, left alone)"
+        table.add_row(kind, f"{item.size / 1e6:.2f}", f"{item.last_used:%Y-%m-%d %H:%M}", item.key[:16])
+    out.print(table)
+    out.print(f"{len(items)} entries, {sum(item.size for item in items) / 1e6:.1f} MB in {cache_tools.folder()}")
+
+
+@cache_app.command("clear")
+def cache_clear(
+    unused_days: Annotated[float, typer.Option(help="Only what was not used for so many days.")] = 0.0,
+) -> None:
+    """Delete the cache's entries; what is deleted is made again when it is next needed."""
+    done = cache_tools.clear(unused_days=unused_days)
+    out.print(f"Deleted {len(done.removed)} entries, {done.freed / 1e6:.1f} MB.")
+    for item in done.in_use:
+        out.print(f"Left {item.key[:16]}: another process uses it.")
+
+
+@cache_app.command("path")
+def cache_path() -> None:
+    """Print the cache folder (set it by OAT_GYM_CACHE)."""
+    out.print(str(cache_tools.folder()))
+
+
 def open_source(name: str) -> MinariDataset:
-    """Return the dataset of a name: one of `oat_gym.domains.DATASETS`, or the id of a local Minari dataset."""
-    return domains.load(name) if name in domains.DATASETS else find_dataset(name)
+    """Return the dataset of a name: one of `oat_gym.domains.DATASETS`, a local Minari id, or a D4RL file."""
+    return domains.load(name) if name in domains.DATASETS else find_source(name)
 
 
 def draw_figure4(data: AugmentedDataset, path: Path) -> None:

@@ -20,6 +20,7 @@ from oat_gym.cache import canonical
 from oat_gym.episodes import Transitions, collect_transitions
 from oat_gym.errors import ConfigurationError, InvalidDataError
 from oat_gym.export import DATA_FORMATS, DataFormat, check_dataset_id, new_dataset_folder, write_dataset
+from oat_gym.io.d4rl import is_d4rl_path, read_d4rl
 from oat_gym.mining import MiningResult
 from oat_gym.progress import ProgressCallback
 from oat_gym.provenance import Provenance
@@ -38,7 +39,8 @@ class AugmentedDataset(MinariDataset):
     kept in the cache (`OAT_GYM_CACHE`), so that they happen once. Everything that reads a Minari dataset reads it.
 
     Args:
-        source: a Minari dataset (an augmented or a filtered one too), or the id of an installed or embedded one.
+        source: a Minari dataset (an augmented or a filtered one too), the id of an installed or embedded one, or the path
+            of a D4RL HDF5 file.
         augmenter: the method, `OAT()` by default; see `oat_gym.AUGMENTERS`.
         factor: how many times the episodes of the source the dataset has in all, at least 1 (10 by default).
         count: the number of synthetic episodes, in place of `factor`.
@@ -58,15 +60,15 @@ class AugmentedDataset(MinariDataset):
 
     def __init__(
         self,
-        source: MinariDataset | str,
+        source: MinariDataset | str | PathLike[str],
         augmenter: Augmenter | None = None,
         *,
         factor: float | None = None,
         count: int | None = None,
         seed: int = 0,
     ) -> None:
-        if isinstance(source, str):
-            source = find_dataset(source)
+        if isinstance(source, str | PathLike):
+            source = find_source(source)
         if not isinstance(source, MinariDataset):
             raise ConfigurationError(f"The source must be a Minari dataset or the id of one, got {source!r}.")
         if augmenter is None:
@@ -263,8 +265,18 @@ class AugmentedDataset(MinariDataset):
         )
 
 
+def find_source(name: str | PathLike[str]) -> MinariDataset:
+    """Return the dataset that `name` names: the id of a local or embedded one, or the path of a D4RL HDF5 file.
+
+    Raises:
+        DatasetNotFoundError: if it is not on this machine; nothing is downloaded.
+        ConfigurationError: if it is neither an id nor such a path.
+    """
+    return read_d4rl(Path(name)) if is_d4rl_path(name) else find_dataset(str(name))
+
+
 def augment(
-    source: MinariDataset | str,
+    source: MinariDataset | str | PathLike[str],
     augmenter: Augmenter | None = None,
     *,
     factor: float | None = None,

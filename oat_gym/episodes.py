@@ -151,11 +151,21 @@ def hash_episode(digest: Any, episode: EpisodeData) -> None:
 
 
 def plain_infos(infos: Any) -> Any:
-    """Return infos with dictionaries nested in arrays (as Minari's arrow storage gives them) as nested dictionaries."""
+    """Return infos in one form, whatever storage format they come from.
+
+    Dictionaries nested in arrays (as Minari's arrow storage gives them) become nested dictionaries. Strings, which HDF5
+    gives as bytes in an array of objects and arrow as an array of fixed width that HDF5 refuses, become lists.
+    """
     if isinstance(infos, dict):
         return {key: plain_infos(part) for key, part in infos.items()}
-    if isinstance(infos, np.ndarray) and infos.dtype == object and len(infos) and isinstance(infos[0], dict):
+    if not isinstance(infos, np.ndarray) or not infos.ndim or not len(infos):
+        return infos
+    if infos.dtype == object and isinstance(infos[0], dict):
         return {key: plain_infos(np.array([part[key] for part in infos])) for key in infos[0]}
+    if infos.dtype.kind == "U" and infos.ndim == 1:
+        return infos.tolist()
+    if infos.dtype == object and infos.ndim == 1 and all(isinstance(text, bytes) for text in infos):
+        return [text.decode() for text in infos]
     return infos
 
 

@@ -1,3 +1,4 @@
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -5,7 +6,15 @@ import numpy as np
 import pytest
 
 from oat_gym import cache
-from oat_gym.cache import CacheEntry, CacheWarning, canonical, fingerprint, read_sealed, write_sealed
+from oat_gym.cache import (
+    CacheEntry,
+    CacheWarning,
+    NewerFormatError,
+    canonical,
+    fingerprint,
+    read_sealed,
+    write_sealed,
+)
 from oat_gym.errors import CacheError
 
 
@@ -46,9 +55,9 @@ def test_any_flipped_byte_is_found(tmp_path: Path) -> None:
     write_sealed(path, {"weights": np.arange(5, dtype=np.float32)}, {"epochs": 3})
     good = path.read_bytes()
     read, value = read_sealed(path)
-    for position in range(len(good)):
+    for position, mask in itertools.product(range(len(good)), (0x01, 0x11, 0x80, 0xFF)):
         damaged = bytearray(good)
-        damaged[position] ^= 0x11
+        damaged[position] ^= mask
         path.write_bytes(damaged)
         try:
             got, got_value = read_sealed(path)
@@ -57,6 +66,36 @@ def test_any_flipped_byte_is_found(tmp_path: Path) -> None:
         # A byte that means nothing (padding) may pass, but never with other content.
         assert got_value == value
         np.testing.assert_array_equal(got["weights"], read["weights"])
+
+
+def test_equal_content_gives_equal_bytes(tmp_path: Path) -> None:
+    arrays = {"b": np.ones(3, dtype=np.float32), "a": np.arange(4), "c/d": np.zeros((2, 1), dtype=bool)}
+    for number in range(10):
+        write_sealed(tmp_path / f"{number}", dict(sorted(arrays.items(), reverse=bool(number % 2))), {"x": 1, "y": [2]})
+    assert len({(tmp_path / f"{number}").read_bytes() for number in range(10)}) == 1
+
+
+def test_what_a_killed_process_left_goes_with_the_next_lock(tmp_path: Path) -> None:
+    entry = CacheEntry("abcd", folder=tmp_path)
+    entry.write("model", {"weights": np.ones(2)}, None)
+    (entry.path / ".model.safetensors.0123abcd").write_bytes(b"half")
+    with entry.lock():
+        assert [path.name for path in entry.path.iterdir()] == ["model.safetensors"]
+
+
+def test_a_newer_format_is_neither_read_nor_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = CacheEntry("abcd", folder=tmp_path)
+    with monkeypatch.context() as newer:
+        newer.setattr(cache, "FORMAT_VERSION", 2)
+        assert entry.write("model", {"weights": np.ones(2)}, None)
+    path = entry.path / "model.safetensors"
+    before = path.read_bytes()
+    with pytest.raises(NewerFormatError, match="update oat_gym"):
+        read_sealed(path)
+    with pytest.warns(CacheWarning, match="left alone"):
+        assert entry.read("model") is None
+    assert not entry.write("model", {"weights": np.zeros(2)}, None)
+    assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize("size", [0, 4, 30, -1])

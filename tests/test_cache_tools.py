@@ -46,21 +46,17 @@ def test_an_absent_cache_is_empty():
 
 def test_every_kind_is_listed_with_its_size_and_the_longest_unused_first():
     old, new = fill("ab12", 500, days_ago=9), fill("ab34", 10, days_ago=2)
-    domain = cache.cache_folder() / "domains" / "door-human-0123"
-    (domain / "data").mkdir(parents=True)
-    (domain / "data" / "main_data.hdf5").write_bytes(b"x" * 77)
-    age(domain, 5)
     other = cache.cache_folder() / "precious"
     other.mkdir()
     age(other, 1)
     data = read_d4rl({"observations": np.zeros((2, 1)), "actions": np.zeros((2, 1)), "rewards": np.zeros(2),
                       "terminals": np.ones(2)})  # fmt: skip
     items = list_entries()
-    assert [item.kind for item in items] == ["fit", "domain", "fit", "other", "dataset"]
-    assert [item.path for item in items[:4]] == [old.path, domain, new.path, other]
-    assert Path(data.storage.data_path).is_relative_to(items[4].path)
+    assert [item.kind for item in items] == ["fit", "fit", "other", "dataset"]
+    assert [item.path for item in items[:3]] == [old.path, new.path, other]
+    assert Path(data.storage.data_path).is_relative_to(items[3].path)
     assert [item.size for item in items] == [size_of(item.path) for item in items]
-    assert [item.version for item in items] == [FORMAT_VERSION, None, FORMAT_VERSION, None, FORMAT_VERSION]
+    assert [item.version for item in items] == [FORMAT_VERSION, FORMAT_VERSION, None, FORMAT_VERSION]
     assert abs(items[0].last_used.timestamp() - (time.time() - 9 * DAY)) < 60
     assert items[0].key == "ab12"
 
@@ -110,17 +106,6 @@ def test_an_entry_that_another_process_holds_is_left():
     assert [item.path for item in done.in_use] == [held.path]
     assert held.read("model") is not None
     assert [item.path for item in clear().removed] == [held.path]
-
-
-def test_work_of_a_running_process_is_left_and_that_of_a_dead_one_is_not():
-    domains = cache.cache_folder() / "domains"
-    for name in (".door-fresh", ".door-stale"):
-        (domains / name).mkdir(parents=True)
-        (domains / name / "part").write_bytes(b"x")
-    age(domains / ".door-stale", 1)
-    done = clear()
-    assert [item.key for item in done.removed] == [".door-stale"]
-    assert [(item.key, item.kind) for item in done.in_use] == [(".door-fresh", "unfinished")]
 
 
 def test_links_are_not_followed(tmp_path):

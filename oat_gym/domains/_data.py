@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
 
 import minari
 
-from oat_gym.cache import cache_folder
-from oat_gym.errors import DatasetExistsError, DatasetNotFoundError
-
-logger = logging.getLogger(__name__)
+from oat_gym.cache import fingerprint
+from oat_gym.errors import DatasetNotFoundError
+from oat_gym.io._cached_dataset import cached_dataset
 
 
 def data_folder() -> Path | None:
@@ -56,15 +54,17 @@ def converted(
 ) -> minari.MinariDataset:
     """Return the dataset converted from `source`, from the cache where it was converted before.
 
-    `write` gets the folder to make. The folder's name holds a hash of the source's bytes, the converter's `version` and
-    Minari's (which refuses data of a newer one), so changed data or code never meets an old conversion.
+    `write` gets the folder to make, as `dataset_from_episodes` takes it. The cache knows the conversion by the source's
+    bytes, the converter's `version` and Minari's (which refuses data of a newer one), so changed data or code never
+    meets an old one.
     """
-    parts = f"|{name}|{version}|{minari.__version__}"
-    key = hashlib.sha256(source.read_bytes() + parts.encode()).hexdigest()[:16]
-    folder = cache_folder() / "domains" / f"{name}-{key}"
-    if not folder.exists():
-        try:
-            return write(folder)
-        except DatasetExistsError:  # another process made the same folder in the meantime
-            logger.debug("%s was written by another process", folder)
-    return minari.MinariDataset(folder / "data")
+    content = hashlib.sha256(source.read_bytes()).hexdigest()
+
+    def fill(data: Path) -> None:
+        made = data.parent / "made"
+        write(made)
+        data.rmdir()
+        (made / "data").rename(data)
+        made.rmdir()
+
+    return cached_dataset(fingerprint(domain=name, content=content, version=version, minari=minari.__version__), fill)

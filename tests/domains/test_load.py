@@ -1,6 +1,7 @@
 """Loading by name, where data is looked for, and what is said when it is not there."""
 
 import doctest
+import shutil
 from pathlib import Path
 
 import minari
@@ -59,23 +60,27 @@ def test_examples_in_docstrings(module):
     assert doctest.testmod(module).failed == 0
 
 
-def test_conversion_happens_once_and_follows_the_source(tmp_path, monkeypatch):
-    monkeypatch.setenv("OAT_GYM_CACHE", str(tmp_path / "cache"))
+def test_conversion_happens_once_and_follows_the_source(tmp_path):
     calls: list[Path] = []
 
     def write(folder: Path) -> minari.MinariDataset:
         calls.append(folder)
-        (folder / "data").parent.mkdir(parents=True)
-        return marker
+        shutil.copytree(maze2d.umaze().storage.data_path, folder / "data")
+        return minari.MinariDataset(folder / "data")
 
-    marker = maze2d.umaze()
-    monkeypatch.setattr(minari, "MinariDataset", lambda path: path)
     source = tmp_path / "source"
     source.write_text("one")
-    assert _data.converted("x", source, version=1, write=write) is marker
-    assert _data.converted("x", source, version=1, write=write) == calls[0] / "data"
+    assert len(_data.converted("x", source, version=1, write=write)) == 250
+    again = _data.converted("x", source, version=1, write=write)
+    assert len(calls) == 1
     _data.converted("x", source, version=2, write=write)
     source.write_text("two")
     _data.converted("x", source, version=1, write=write)
-    assert len(calls) == len(set(calls)) == 3
-    assert all(folder.is_relative_to(tmp_path / "cache") for folder in calls)
+    assert len(calls) == 3
+    path = again.storage.data_path / "main_data.hdf5"
+    damaged = bytearray(path.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    path.write_bytes(damaged)
+    source.write_text("one")
+    assert len(_data.converted("x", source, version=1, write=write)) == 250
+    assert len(calls) == 4  # a damaged conversion is made again

@@ -77,13 +77,13 @@ def items(
 
 
 def damaged(good: bytes) -> Iterator[tuple[str, bytes]]:
-    """Yield forms of a file with one byte changed, at both ends and at 12 places between, and cut ones."""
-    places = sorted({0, 1, 8, 40, len(good) - 1, *np.linspace(2, len(good) - 2, 12, dtype=int).tolist()})
+    """Yield forms of a file with one byte changed, at both ends and at places between, and cut ones."""
+    places = sorted({0, 1, 8, 40, len(good) - 1, *np.linspace(2, len(good) - 2, 6, dtype=int).tolist()})
     for place in places:
         changed = bytearray(good)
         changed[place] ^= 1 << (place % 8)
         yield f"bit {place % 8} of byte {place}", bytes(changed)
-    for size in (0, 1, 7, 200, len(good) // 2, len(good) - 1):
+    for size in (0, 7, len(good) // 2, len(good) - 1):
         yield f"cut to {size}", good[:size]
 
 

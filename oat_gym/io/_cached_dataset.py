@@ -38,7 +38,7 @@ def cached_dataset(key: str, write: Callable[[Path], None]) -> MinariDataset:
             except OSError as error:
                 raise CacheError(
                     f"The converted dataset cannot be stored in the cache at {entry.path} ({error}). Free some space, "
-                    "name another folder in OAT_GYM_CACHE, or pass dataset_id."
+                    "or name another folder in OAT_GYM_CACHE."
                 ) from error
     return MinariDataset(folder / "data")
 
