@@ -15,7 +15,9 @@ from oat_gym.augmenters import AUGMENTERS, Augmenter, Function
 from oat_gym.augmenters.oat import OAT
 from oat_gym.dataset import AugmentedDataset, augment, install
 from oat_gym.episodes import Transitions
+from oat_gym.io.consumers import to_d3rlpy, to_torchrl
 from oat_gym.io.d4rl import read_d4rl, write_d4rl
+from oat_gym.io.torch import LoaderConfig, TorchBatch, TorchLoader, to_torch
 from oat_gym.mining import MiningConfig, MiningResult
 from oat_gym.provenance import Provenance
 from oat_gym.stitching import Span
@@ -30,14 +32,20 @@ __all__ = [
     "AugmentedDataset",
     "Augmenter",
     "Function",
+    "LoaderConfig",
     "MiningConfig",
     "MiningResult",
     "Provenance",
     "Span",
+    "TorchBatch",
+    "TorchLoader",
     "Transitions",
     "augment",
     "domains",
     "mining",
     "read_d4rl",
+    "to_d3rlpy",
+    "to_torch",
+    "to_torchrl",
     "write_d4rl",
 ]

@@ -23,6 +23,7 @@ from oat_gym.dataset import AugmentedDataset, find_source
 from oat_gym.domains import maze2d
 from oat_gym.errors import ConfigurationError, DatasetExistsError, OatGymError
 from oat_gym.export import DATA_FORMATS, check_dataset_id
+from oat_gym.generation import VAEMDPConfig
 from oat_gym.mining import MiningConfig, MiningResult
 from oat_gym.progress import progress_bar
 from oat_gym.recipe import find_dataset
@@ -36,9 +37,11 @@ out = Console(highlight=False, soft_wrap=True)
 DEMO_ID = "maze2d-umaze/oat-v0"
 DEMO_CONFIG = OAT(
     mining=MiningConfig(n_clusters="auto", candidates=tuple(range(4, 11)), switch_penalty=20.0, top=3),
+    model=VAEMDPConfig(max_updates=600),
+    start="posterior",
     features=("achieved_goal",),
 )
-"""Three PST sets, as in the paper's Fig. 4, of clusters of places in the maze."""
+"""Three PST sets, as in the paper's Fig. 4, of clusters of places in the maze; roll-outs start where the span does."""
 
 Dataset = Annotated[str, typer.Argument(help="Id of a local Minari dataset, path of a D4RL file, or one of "+ ", ".join(domains.DATASETS) + ".")]
 Method = Annotated[str, typer.Option("--augmenter", help=f"One of {', '.join(AUGMENTERS)}.")]

@@ -210,9 +210,12 @@ class AugmentedStorage(MinariStorage):
         return json.loads(path.read_text()) if path.exists() else {}
 
     def get_size(self) -> float:
-        """Return the size of the source and of our own files, in MB."""
-        source = self.synthesis.source.dataset.storage.get_size() if self.synthesis else 0.0
-        return float(np.round(source + super().get_size(), 1))
+        """Return the size in MB of the source and of the episodes that were appended."""
+        if self.synthesis is None:
+            return float(super().get_size())
+        has_appended = (self.data_path / APPENDED).exists()
+        appended = self._appended_storage().get_size() if has_appended else 0.0
+        return float(np.round(self.synthesis.source.dataset.storage.get_size() + appended, 1))
 
     def _kind(self, number: int, total: int) -> str:
         if not 0 <= number < total:

@@ -18,7 +18,7 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("command", [[], ["demo"], ["augment"], ["inspect"]])
+@pytest.mark.parametrize("command", [[], ["demo"], ["augment"], ["inspect"], ["cache"], ["cache", "list"]])
 def test_help(command: list[str]) -> None:
     result = CliRunner().invoke(cli.app, [*command, "--help"])
     assert result.exit_code == 0
@@ -86,3 +86,14 @@ def test_demo_writes_one_folder_and_runs_twice(tmp_path: Path, monkeypatch: pyte
     assert len(saved) == 500
     other = CliRunner().invoke(cli.app, ["demo", "--factor", "3"])
     assert "already at" in str(other.exception)
+
+
+def test_the_cache_is_listed_and_cleared(walk_dataset: minari.MinariDataset, tiny_oat: OAT) -> None:
+    AugmentedDataset(walk_dataset, tiny_oat, factor=2).fit()
+    runner = CliRunner()
+    listed = runner.invoke(cli.app, ["cache", "list"])
+    assert "1 entries" in listed.output
+    path = runner.invoke(cli.app, ["cache", "path"]).output.strip()
+    assert Path(path).is_dir()
+    assert "Deleted 1 entries" in runner.invoke(cli.app, ["cache", "clear"]).output
+    assert "0 entries" in runner.invoke(cli.app, ["cache", "list"]).output

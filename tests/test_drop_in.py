@@ -1,6 +1,7 @@
 """Minari's own behaviours on every space that it stores, in its three formats, with and without synthetic episodes."""
 
 import copy
+import gc
 import multiprocessing
 import os
 import pickle
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from minari import EpisodeData, MinariDataset
+from minari.cli import app
 from minari.data_collector import EpisodeBuffer
 from typer.testing import CliRunner
 
@@ -62,7 +64,9 @@ def batch(space: spaces.Space, rows: int) -> Any:
     return samples if isinstance(space, spaces.Text) else np.stack(samples).astype(space.dtype)
 
 
-def buffer(number: int, length: int, observation_space: spaces.Space, action_space: spaces.Space) -> EpisodeBuffer:
+def buffer(
+    number: int, length: int, observation_space: spaces.Space, action_space: spaces.Space, *, infos: bool = True
+) -> EpisodeBuffer:
     observation_space.seed(number)
     action_space.seed(number)
     steps = np.arange(length + 1)
@@ -78,21 +82,25 @@ def buffer(number: int, length: int, observation_space: spaces.Space, action_spa
             "clock": list(1000.0 * number + steps),
             "word": [f"w{number}-{step}" for step in steps],
             "nested": {"twice": np.stack([steps, steps], axis=1).astype(np.float32)},
-        },
+        }
+        if infos
+        else None,
     )
 
 
-def create(dataset_id: str, kind: str, data_format: str, **settings: Any) -> MinariDataset:
+def create(dataset_id: str, kind: str, data_format: str, *, infos: bool = True) -> MinariDataset:
     observation_space, action_space = SPACES[kind]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         dataset = minari.create_dataset_from_buffers(
             dataset_id,
-            [buffer(number, length, observation_space, action_space) for number, length in enumerate(LENGTHS)],
+            [
+                buffer(number, length, observation_space, action_space, infos=infos)
+                for number, length in enumerate(LENGTHS)
+            ],
             observation_space=observation_space,
             action_space=action_space,
             data_format=data_format,
-            **settings,
         )
     dataset.storage.update_episode_metadata([{"note": f"n{number}", "level": number} for number in range(4)])
     return dataset
@@ -117,7 +125,7 @@ def content(episode: EpisodeData) -> dict[str, Any]:
     return {key: plain(value) for key, value in vars(episode).items() if key != "id"}
 
 
-@pytest.fixture(params=[(kind, name) for kind in SPACES for name in FORMATS], ids=lambda pair: "-".join(pair))
+@pytest.fixture(params=[(kind, name) for kind in SPACES for name in FORMATS], ids="-".join)
 def real(request: pytest.FixtureRequest) -> MinariDataset:
     return create("test/real-v0", *request.param)
 
@@ -142,7 +150,10 @@ def test_the_contract_holds_and_it_reads_as_minari_reads(real: MinariDataset, mo
     metadata = list(data.storage.get_episode_metadata(iter(range(total))))
     for number, part in enumerate(metadata):
         assert (part["id"], part["total_steps"]) == (number, LENGTHS[number % 4])
-        assert (part["seed"], plain(part["options"])) == (number % 4, {"goal": {"row": number % 4}, "start": [number % 4, 1]})
+        assert (part["seed"], plain(part["options"])) == (
+            number % 4,
+            {"goal": {"row": number % 4}, "start": [number % 4, 1]},
+        )
         assert (part["note"], part["level"]) == (f"n{number % 4}", number % 4)
 
 
@@ -239,16 +250,22 @@ def test_a_view_changed_later_does_not_change_what_was_augmented(small: MinariDa
     assert [content(episode) for episode in data] == expected
     for twin in (pickle.loads(pickle.dumps(data)), pickle.loads(dumped), copy.deepcopy(data)):
         assert [content(episode) for episode in twin] == expected
-    run = multiprocessing.get_context("spawn").Pool(1)
-    with run as pool:
-        assert pool.apply(_read, (data,)) == expected
+
+
+def test_a_spawned_process_reads_the_same() -> None:
+    data = augmented(create("test/small-v0", "nested", "hdf5"), "identity")
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.apply(_read, (data,)) == _read(data)
 
 
 def _read(data: AugmentedDataset) -> list[dict[str, Any]]:
     return [content(episode) for episode in data]
 
 
-def test_minari_combines_and_splits(small: MinariDataset) -> None:
+@pytest.mark.parametrize("data_format", FORMATS)
+def test_minari_combines_and_splits(data_format: str) -> None:
+    # without infos: Minari's arrow storage cannot combine two datasets of its own that have strings or nested ones
+    small = create("test/small-v0", "nested", data_format, infos=False)
     data = augmented(small, "identity")
     combined = minari.combine_datasets([data, small], "test/combined-v0")
     assert (len(combined), combined.total_steps) == (14, 37 + 14)
@@ -261,7 +278,9 @@ def test_minari_combines_and_splits(small: MinariDataset) -> None:
     ]
     parts = minari.split_dataset(data, [4, 6], seed=1)
     for part in parts:
-        assert all(content(a) == content(b) for a, b in zip(part, data.iterate_episodes(part.episode_indices), strict=True))
+        assert all(
+            content(a) == content(b) for a, b in zip(part, data.iterate_episodes(part.episode_indices), strict=True)
+        )
 
 
 def test_metadata_handed_out_is_a_copy(small: MinariDataset) -> None:
@@ -308,55 +327,6 @@ def test_metadata_that_lies_about_lengths_is_an_error() -> None:
 
 # Environments, scores, collectors, the command line --------------------------------------------------------------
 
-
-class Walk(gymnasium.Env):
-    """Five steps to the right or to the left."""
-
-    observation_space = spaces.Box(-5, 5, (1,), np.float32)
-    action_space = spaces.Discrete(2)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        super().reset(seed=seed)
-        self.place, self.steps = 0, 0
-        return self._observe(), {}
-
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
-        self.place += 2 * int(action) - 1
-        self.steps += 1
-        return self._observe(), float(self.place), self.steps == 5, False, {}
-
-    def _observe(self) -> np.ndarray:
-        return np.array([self.place], dtype=np.float32)
-
-
-@pytest.fixture
-def collected(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], MinariDataset]:
-    monkeypatch.setitem(
-        gymnasium.registry, "Walk-v0", gymnasium.envs.registration.EnvSpec("Walk-v0", entry_point=Walk)
-    )
-
-    def collect(data_format: str) -> MinariDataset:
-        spec = gymnasium.envs.registration.EnvSpec("CartPole-v1", entry_point=_ENTRY)
-        evaluation = copy.deepcopy(spec)
-        evaluation.max_episode_steps = 77
-        rng = np.random.default_rng(0)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            return minari.create_dataset_from_buffers(
-                "test/cart-v0",
-                [_cart_episode(number, rng) for number in range(3)],
-                env=spec,
-                eval_env=evaluation,
-                ref_min_score=-1.0,
-                ref_max_score=9.0,
-                author={"a", "b"},
-                requirements=["numpy>=1"],
-                data_format=data_format,
-            )
-
-    return collect
-
-
 _ENTRY = "gymnasium.envs.classic_control.cartpole:CartPoleEnv"
 
 
@@ -371,10 +341,30 @@ def _cart_episode(number: int, rng: np.random.Generator) -> EpisodeBuffer:
     )
 
 
+def collect(data_format: str) -> MinariDataset:
+    spec = gymnasium.envs.registration.EnvSpec("CartPole-v1", entry_point=_ENTRY)
+    evaluation = copy.deepcopy(spec)
+    evaluation.max_episode_steps = 77
+    rng = np.random.default_rng(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return minari.create_dataset_from_buffers(
+            "test/cart-v0",
+            [_cart_episode(number, rng) for number in range(3)],
+            env=spec,
+            eval_env=evaluation,
+            ref_min_score=-1.0,
+            ref_max_score=9.0,
+            author={"a", "b"},
+            requirements=["numpy>=1"],
+            data_format=data_format,
+        )
+
+
 @pytest.mark.parametrize("data_format", FORMATS)
 @pytest.mark.parametrize("mode", MODES)
-def test_environments_and_scores(collected: Callable[[str], MinariDataset], data_format: str, mode: str) -> None:
-    real = collected(data_format)
+def test_environments_and_scores(data_format: str, mode: str) -> None:
+    real = collect(data_format)
     data = augmented(real, mode)
     for dataset in (data, data.save("test/copy-v0", data_format=data_format)):
         assert dataset.env_spec == real.env_spec
@@ -388,11 +378,10 @@ def test_environments_and_scores(collected: Callable[[str], MinariDataset], data
         assert dataset.observation_space == real.observation_space
 
 
+@pytest.mark.filterwarnings("ignore:Implicitly cleaning up:ResourceWarning")
 @pytest.mark.parametrize("data_format", FORMATS)
-def test_a_data_collector_adds_to_it(
-    collected: Callable[[str], MinariDataset], data_format: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data = augmented(collected(data_format), "identity")
+def test_a_data_collector_adds_to_it(data_format: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = augmented(collect(data_format), "identity")
     monkeypatch.setitem(sys.modules, "jax", _Jax)
     monkeypatch.setitem(sys.modules, "jax.tree_util", _Jax.tree_util)
     env = minari.DataCollector(gymnasium.make("CartPole-v1"), data_format=data_format)
@@ -403,6 +392,9 @@ def test_a_data_collector_adds_to_it(
             _, _, terminated, truncated, _ = env.step(env.action_space.sample())
             done = terminated or truncated
     env.add_to_dataset(data)
+    env.close()
+    del env
+    gc.collect()  # Minari's collector leaves its temporary folders to the garbage collector, which warns
     assert (len(data), data.storage.total_episodes) == (11, 11)
     assert data[9].terminations[-1]
     assert len(data.source) == 3
@@ -420,9 +412,9 @@ class _Jax:
             return function(tree, *others)
 
 
-def test_minaris_command_line_reads_a_saved_one(small: MinariDataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    from minari.cli import app
-
+@pytest.mark.parametrize("data_format", FORMATS)
+def test_minaris_command_line_reads_a_saved_one(data_format: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = create("test/small-v0", "nested", data_format, infos=False)
     data = augmented(small, "identity")
     data.save("test/one-v0", data_format=small.storage.FORMAT)
     data.save("test/two-v0", data_format=small.storage.FORMAT)

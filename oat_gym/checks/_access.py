@@ -39,7 +39,7 @@ def ids(subject: Subject) -> int:
     if len(np.unique(indices)) != len(indices):
         values, counts = np.unique(indices, return_counts=True)
         raise Broken(f"the id {values[counts > 1][0]} is there {counts.max()} times")
-    if len(indices) and not (0 <= indices.min() and indices.max() < total):
+    if not np.isin(indices, np.arange(total)).all():
         raise Broken(f"ids {indices.min()} to {indices.max()} are not inside 0..{total - 1} of the storage")
     for number, episode in zip(subject.numbers, subject.episodes, strict=True):
         if int(episode.id) != number:

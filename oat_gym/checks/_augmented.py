@@ -151,7 +151,7 @@ def environment(subject: Subject) -> int:
 
 
 def transitions(subject: Subject) -> int:
-    """transitions() has the rows of the episodes in order; s' of step t is observations[t+1] but at literal seams."""
+    """The columns of transitions() are the rows of the episodes in order; s' of step t is observations[t+1] but at literal seams."""
     view = copy.copy(subject.augmented)
     view.episode_indices = np.array(subject.numbers, dtype=np.int64)
     columns, start = view.transitions(), 0
@@ -198,9 +198,7 @@ def _expect_rows(
 def rebuilding(subject: Subject) -> int:
     """The same source, augmenter, count and seed give the same bytes again."""
     synthesis, n_planned = subject.augmented.synthesis, subject.augmented.storage.n_planned
-    twin = AugmentedDataset(
-        synthesis.source.view, synthesis.augmenter, count=synthesis.count, seed=synthesis.seed
-    )
+    twin = AugmentedDataset(synthesis.source.view, synthesis.augmenter, count=synthesis.count, seed=synthesis.seed)
     planned = [(place, number) for place, number in enumerate(subject.numbers) if number < n_planned]
     for place, number in planned:
         subject.expect_equal(twin[number], place, "the dataset built again")

@@ -133,7 +133,9 @@ def finite(subject: Subject) -> int:
     count = 0
     for episode in subject.episodes:
         if not np.isfinite(episode.rewards).all():
-            raise Broken(f"episode {episode.id}: the reward at step {_first(~np.isfinite(episode.rewards))} is not finite")
+            raise Broken(
+                f"episode {episode.id}: the reward at step {_first(~np.isfinite(episode.rewards))} is not finite"
+            )
         for where, values, space, _ in _array_parts(episode, subject):
             if np.issubdtype(values.dtype, np.inexact) and np.isnan(values).any():
                 raise Broken(f"{where} is NaN at row {_first(np.isnan(values).reshape(len(values), -1).any(axis=1))}")

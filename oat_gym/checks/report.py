@@ -62,7 +62,7 @@ class Report:
         return "\n".join(lines)
 
 
-class ChecksFailed(ConformanceError):
+class ChecksFailed(ConformanceError):  # noqa: N818  (an error by its base: ConformanceError)
     """At least one check failed; `report` has all findings, and the message lists them."""
 
     def __init__(self, report: Report) -> None:

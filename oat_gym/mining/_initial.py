@@ -6,10 +6,6 @@ import warnings
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.cluster import KMeans
-from sklearn.decomposition import PCA
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.mixture import GaussianMixture
 
 from oat_gym.mining._windows import Rows
 
@@ -37,6 +33,9 @@ def kmeans_labels(rows: Rows, *, n_clusters: int, seed: int) -> Ints:
 
 def mixture_labels(rows: Rows, *, n_clusters: int, seed: int) -> Ints:
     """Label each row by its component in a full-covariance Gaussian mixture: (n,) labels."""
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.mixture import GaussianMixture
+
     values = _reduce(rows.values, _BLOCK_ROWS, seed)
     rng = np.random.default_rng(seed)
     many = len(values) > _MAX_MIXTURE_ROWS
@@ -61,6 +60,8 @@ def mixture_labels(rows: Rows, *, n_clusters: int, seed: int) -> Ints:
 
 
 def _reduce(values: Floats, n_components: int, seed: int) -> Floats:
+    from sklearn.decomposition import PCA
+
     if values.shape[1] <= n_components or len(values) <= n_components:
         return values
     return np.asarray(PCA(n_components, svd_solver="randomized", random_state=seed).fit_transform(values))
@@ -81,6 +82,9 @@ def _block_moments(values: Floats, block: Ints) -> Floats:
 
 def _kmeans(points: Floats, n_clusters: int, seed: int) -> Ints:
     """k-means with as many clusters as there are distinct points, at most `n_clusters`."""
+    from sklearn.cluster import KMeans
+    from sklearn.exceptions import ConvergenceWarning
+
     distinct = len(np.unique(points, axis=0))
     with warnings.catch_warnings():  # nearly equal points can still merge
         warnings.simplefilter("ignore", ConvergenceWarning)

@@ -7,7 +7,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.metrics import silhouette_score
 from threadpoolctl import threadpool_limits
 
 from oat_gym.mining._em import score_table
@@ -125,6 +124,8 @@ def _silent(description: str, done: int, total: int) -> None:
 
 def silhouette(model: TICC, rows: Rows, sample: NDArray[np.int64]) -> float:
     """Return the mean silhouette of the z-scored rows in `sample`; -1 where only one label, or one a row, occurs."""
+    from sklearn.metrics import silhouette_score
+
     labels = np.concatenate(model.labels_)[sample]
     if not 1 < len(np.unique(labels)) < len(labels):
         return -1.0

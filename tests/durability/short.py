@@ -10,12 +10,13 @@ import kill
 
 
 def main() -> int:
-    """Kill six times at random moments and six times at changes of the file system; let eight processes compete."""
+    """Kill six times at random moments and three times before changes of the file system; let eight processes compete."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        harness = kill.Harness(folder / "kill", list(kill.JOBS))
         summary = {
-            "random": kill.run(folder / "random", kills=6, seed=0, what="all"),
-            "steps": kill.run(folder / "steps", kills=6, seed=0, what="all", at="steps"),
+            "random": kill.run(harness, kills=6, seed=0, what="all"),
+            "steps": kill.run(harness, kills=3, seed=0, what="all", at="steps"),
             "crowd": crowd.run(folder / "crowd", processes=8),
         }
     print(json.dumps(summary))

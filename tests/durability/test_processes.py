@@ -18,12 +18,11 @@ def summary() -> dict[str, Any]:
 
 
 def test_a_kill_at_a_random_moment_loses_nothing(summary: dict[str, Any]) -> None:
-    assert summary["random"]["kills"] == 6
-    assert summary["random"]["landed"] >= 1
+    assert sum(summary["random"]["phases"].values()) == 6
 
 
 def test_a_kill_before_any_change_of_the_file_system_loses_nothing(summary: dict[str, Any]) -> None:
-    assert summary["steps"]["landed"] == 6
+    assert sum(summary["steps"]["phases"].values()) == 3
     assert all(steps > 5 for steps in summary["steps"]["steps"].values())
 
 

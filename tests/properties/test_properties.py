@@ -82,7 +82,9 @@ AUGMENTERS = (Function(identity), Function(noisy_rewards), Splice())
 
 @st.composite
 def boxes(draw: st.DrawFn) -> spaces.Space:
-    dtype = draw(st.sampled_from(["float32", "float64", "float16", "int8", "int16", "int32", "int64", "uint8", "uint16"]))
+    dtype = draw(
+        st.sampled_from(["float32", "float64", "float16", "int8", "int16", "int32", "int64", "uint8", "uint16"])
+    )
     shape = draw(st.sampled_from([(), (1,), (3,), (2, 2), (1, 2, 3)]))
     if dtype.startswith("float") and draw(st.booleans()):
         return spaces.Box(-np.inf, np.inf, shape, dtype=dtype)
@@ -229,5 +231,3 @@ def test_random_datasets_keep_every_invariant(
         assert len(report.passed) >= 36
         assert {name for name, _ in report.skipped} <= {"saving"}
         event(f"{len(report.passed)} invariants passed")
-
-
