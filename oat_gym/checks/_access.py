@@ -52,10 +52,9 @@ def metadata_steps(subject: Subject) -> int:
     if len(subject.metadata) != len(subject.episodes):
         raise Broken(f"{len(subject.episodes)} episodes have {len(subject.metadata)} metadata")
     for episode, metadata in zip(subject.episodes, subject.metadata, strict=True):
-        if metadata.get("total_steps") != len(episode.rewards):
-            raise Broken(
-                f"episode {episode.id} has {len(episode.rewards)} steps, its metadata says {metadata.get('total_steps')}"
-            )
+        steps, claimed = len(episode.rewards), metadata.get("total_steps")
+        if claimed != steps:
+            raise Broken(f"episode {episode.id} has {steps} steps, its metadata says {claimed}")
         if metadata.get("id", episode.id) != episode.id:
             raise Broken(f"the metadata of episode {episode.id} has the id {metadata['id']}")
     return len(subject.metadata)
@@ -269,13 +268,13 @@ def splitting(subject: Subject) -> int:
     return len(got)
 
 
-READ = ("ids", "determinism")
+READ = ("ids", "size", "determinism")
 ACCESS_CHECKS: tuple[Check[Subject], ...] = (
-    Check("size", "the numbers of episodes agree", size),
-    Check("ids", "ids are unique, known, and those asked for", ids, ("readable", "size")),
+    Check("ids", "ids are unique, known, and those asked for", ids, ("readable",)),
+    Check("size", "the numbers of episodes agree", size, ("ids",)),
     Check("metadata-steps", "metadata has the episode's id and steps", metadata_steps, ("ids", "t-plus-one")),
     Check("total-steps", "total_steps is the sum over episodes", total_steps, ("metadata-steps",)),
-    Check("specification", "dataset, spec and metadata agree", specification),
+    Check("specification", "dataset, spec and metadata agree", specification, ("ids",)),
     Check("determinism", "reading again gives the same", determinism, ("ids",)),
     Check("index-kinds", "any iterable of ids is accepted", index_kinds, READ),
     Check("indexing", "dataset[i] is the i-th episode", indexing, READ),

@@ -151,7 +151,7 @@ def environment(subject: Subject) -> int:
 
 
 def transitions(subject: Subject) -> int:
-    """The columns of transitions() are the rows of the episodes in order; s' of step t is observations[t+1] but at literal seams."""
+    """The columns are the steps in order, and s' of step t is observations[t+1] (literal seams apart)."""
     view = copy.copy(subject.augmented)
     view.episode_indices = np.array(subject.numbers, dtype=np.int64)
     columns, start = view.transitions(), 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -25,13 +25,19 @@ def tree_difference(left: Any, right: Any, where: str) -> str | None:
     if isinstance(left, dict) and isinstance(right, dict):
         if left.keys() != right.keys():
             return f"{where} has the keys {sorted(map(str, left))} against {sorted(map(str, right))}"
-        pairs = ((left[key], right[key], f"{where}[{key!r}]") for key in left)
-        return next(filter(None, (tree_difference(*pair) for pair in pairs)), None)
+        return _first_difference((left[key], right[key], f"{where}[{key!r}]") for key in left)
     if _is_sequence(left) and _is_sequence(right):
         if len(left) != len(right):
             return f"{where} has {len(left)} entries against {len(right)}"
-        pairs = ((a, b, f"{where}[{i}]") for i, (a, b) in enumerate(zip(left, right, strict=True)))
-        return next(filter(None, (tree_difference(*pair) for pair in pairs)), None)
+        return _first_difference((a, b, f"{where}[{i}]") for i, (a, b) in enumerate(zip(left, right, strict=True)))
+    return _leaf_difference(left, right, where)
+
+
+def _first_difference(pairs: Iterable[tuple[Any, Any, str]]) -> str | None:
+    return next(filter(None, (tree_difference(*pair) for pair in pairs)), None)
+
+
+def _leaf_difference(left: Any, right: Any, where: str) -> str | None:
     if isinstance(left, np.ndarray) and isinstance(right, np.ndarray):
         return _array_difference(left, right, where)
     if type(left) is not type(right) or left != right:

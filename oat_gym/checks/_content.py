@@ -136,10 +136,10 @@ def finite(subject: Subject) -> int:
             raise Broken(
                 f"episode {episode.id}: the reward at step {_first(~np.isfinite(episode.rewards))} is not finite"
             )
-        for where, values, space, _ in _array_parts(episode, subject):
+        for where, values, _, _ in _array_parts(episode, subject):
             if np.issubdtype(values.dtype, np.inexact) and np.isnan(values).any():
                 raise Broken(f"{where} is NaN at row {_first(np.isnan(values).reshape(len(values), -1).any(axis=1))}")
-            count += 1 if space is not None else 0
+            count += 1
     return count
 
 

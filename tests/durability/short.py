@@ -10,7 +10,7 @@ import kill
 
 
 def main() -> int:
-    """Kill six times at random moments and three times before changes of the file system; let eight processes compete."""
+    """Kill six times at random moments and thrice before changes of the file system; let eight processes compete."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         harness = kill.Harness(folder / "kill", list(kill.JOBS))

@@ -110,7 +110,7 @@ some_spaces = st.recursive(
 )
 
 
-def batch(space: spaces.Space, rows: int, rng: np.random.Generator) -> Any:
+def batch(space: spaces.Space, rows: int, rng: np.random.Generator) -> Any:  # noqa: PLR0911  (one for each space)
     if isinstance(space, spaces.Dict):
         return {key: batch(child, rows, rng) for key, child in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
