@@ -27,7 +27,7 @@ from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from oat_gym.errors import CacheError
+from oat_gym.errors import CacheError, NewerFormatError
 
 FORMAT_VERSION = 1
 """Part of every path and fingerprint: a newer library never reads, nor touches, an older one's entries."""
@@ -41,10 +41,6 @@ _log = logging.getLogger(__name__)
 
 class CacheWarning(UserWarning):
     """An item could not be kept on disk; the result in memory is complete, but will be made again next time."""
-
-
-class NewerFormatError(CacheError):
-    """A file was written by a newer version of the library: not damaged, not readable here, and to be left alone."""
 
 
 def cache_folder() -> Path:

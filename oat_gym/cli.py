@@ -43,7 +43,8 @@ DEMO_CONFIG = OAT(
 )
 """Three PST sets, as in the paper's Fig. 4, of clusters of places in the maze; roll-outs start where the span does."""
 
-Dataset = Annotated[str, typer.Argument(help="Id of a local Minari dataset, path of a D4RL file, or one of "+ ", ".join(domains.DATASETS) + ".")]
+_NAMES = ", ".join(domains.DATASETS)
+Dataset = Annotated[str, typer.Argument(help=f"Id of a local Minari dataset, path of a D4RL file, or one of {_NAMES}.")]
 Method = Annotated[str, typer.Option("--augmenter", help=f"One of {', '.join(AUGMENTERS)}.")]
 Factor = Annotated[float, typer.Option(help="Episodes in all, as a multiple of the source's.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.")]

@@ -24,11 +24,11 @@ from oat_gym.io.d4rl import is_d4rl_path, read_d4rl
 from oat_gym.mining import MiningResult
 from oat_gym.progress import ProgressCallback
 from oat_gym.provenance import Provenance
-from oat_gym.recipe import RECIPE_FILE, find_dataset, write_recipe
+from oat_gym.recipe import APPENDED, EPISODE_METADATA_FILE, RECIPE_FILE, check_if_augmented, find_dataset, write_recipe
 from oat_gym.serialization import source_metadata
 from oat_gym.source import Source
 from oat_gym.spaces import FlatSpace
-from oat_gym.storage import APPENDED, EPISODE_METADATA_FILE, AugmentedStorage, register, write_metadata
+from oat_gym.storage import AugmentedStorage, register, write_metadata
 from oat_gym.synthesis import Synthesis
 
 
@@ -39,8 +39,8 @@ class AugmentedDataset(MinariDataset):
     kept in the cache (`OAT_GYM_CACHE`), so that they happen once. Everything that reads a Minari dataset reads it.
 
     Args:
-        source: a Minari dataset (an augmented or a filtered one too), the id of an installed or embedded one, or the path
-            of a D4RL HDF5 file.
+        source: a Minari dataset (an augmented or a filtered one too), the id of an installed or embedded one, or the
+            path of a D4RL HDF5 file.
         augmenter: the method, `OAT()` by default; see `oat_gym.AUGMENTERS`.
         factor: how many times the episodes of the source the dataset has in all, at least 1 (10 by default).
         count: the number of synthetic episodes, in place of `factor`.
@@ -289,7 +289,12 @@ def augment(
 
 
 def open_dataset(data_path: str | PathLike[str]) -> MinariDataset:
-    """Return the dataset of a data folder: an `AugmentedDataset` where it holds a recipe, else a `MinariDataset`."""
+    """Return the dataset of a data folder: an `AugmentedDataset` where it holds a recipe, else a `MinariDataset`.
+
+    Raises:
+        InvalidDataError: for an augmented dataset's folder that is damaged or not to be trusted; before it is read.
+    """
+    check_if_augmented(Path(data_path))
     dataset = MinariDataset(data_path)
     if isinstance(dataset.storage, AugmentedStorage) and dataset.storage.synthesis is not None:
         return AugmentedDataset.open(dataset.storage)

@@ -25,8 +25,16 @@ class CacheError(OatGymError, RuntimeError):
     """The cache on disk cannot be used and could not be rebuilt."""
 
 
+class NewerFormatError(CacheError):
+    """A file was written by a newer version of the library: not damaged, not readable here, and to be left alone."""
+
+
 class DatasetExistsError(OatGymError, FileExistsError):
     """A dataset of this id is already there; nothing was written."""
+
+
+class SaveError(OatGymError, OSError):
+    """A dataset could not be saved because the disk refused; nothing was left half-written."""
 
 
 class DatasetNotFoundError(OatGymError, FileNotFoundError):

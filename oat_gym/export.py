@@ -6,7 +6,6 @@ import contextlib
 import errno
 import json
 import os
-import platform
 import re
 import shutil
 import tempfile
@@ -22,9 +21,10 @@ from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
 from minari.namespace import NAMESPACE_METADATA_FILENAME
 from minari.storage import get_dataset_path
 
+from oat_gym._staging import owned_folder
 from oat_gym.cache import write_atomically
 from oat_gym.episodes import plain_infos
-from oat_gym.errors import ConfigurationError, DatasetExistsError, OatGymError
+from oat_gym.errors import ConfigurationError, DatasetExistsError, OatGymError, SaveError
 from oat_gym.serialization import metadata_to_json
 from oat_gym.spaces import map_tree, tree_length
 
@@ -51,10 +51,6 @@ _ERRNO = re.compile(r"errno = (\d+)")  # how HDF5 tells it in its messages
 
 _BATCH_BYTES = 64_000_000
 _EPISODE_OVERHEAD, _LEAF_OVERHEAD = 4_000, 500  # what HDF5 adds, at most, for attributes and for each array
-
-
-class SaveError(OatGymError, OSError):
-    """A dataset could not be written (a full or read-only disk); nothing of it is left, and no other was touched."""
 
 
 def check_dataset_id(dataset_id: str) -> Path:
@@ -97,9 +93,8 @@ def new_dataset_folder(dataset_id: str) -> Generator[Path]:
     """
     path = check_dataset_id(dataset_id).resolve()
     root = get_dataset_path().resolve()  # Minari cannot measure a folder by a relative path
-    _remove_leftovers(root)
     try:
-        staging = Path(tempfile.mkdtemp(prefix=f"{_STAGING}{platform.node()}-{os.getpid()}-", dir=root))
+        staging = owned_folder(_STAGING, root)
     except OSError as error:
         raise _save_error(dataset_id, error) from error
     try:
@@ -312,20 +307,3 @@ def _is_disk_error(error: Exception) -> bool:
     told = _ERRNO.search(str(error))
     number = int(told.group(1)) if told else getattr(error, "errno", None)
     return number in _DISK_ERRORS
-
-
-def _remove_leftovers(root: Path) -> None:
-    for folder in root.glob(f"{_STAGING}{platform.node()}-*"):
-        owner = folder.name.split("-")[-2]
-        if owner.isdecimal() and not _is_running(int(owner)):
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _is_running(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True

@@ -85,8 +85,7 @@ def find_dataset(name: str) -> MinariDataset:
 
 def _load(name: str, data_path: pathlib.Path) -> MinariDataset:
     try:
-        if MinariStorage.read_raw_metadata(data_path).get("data_format") == DATA_FORMAT:
-            check_folder(data_path)
+        check_if_augmented(data_path)
         return minari.load_dataset(name)
     except OatGymError:
         raise
@@ -208,6 +207,12 @@ def _recipe_of_source(path: pathlib.Path) -> pathlib.Path | None:
         return following.resolve() if following.exists() else None
     except (OSError, TypeError, ValueError):  # find_dataset says what is wrong with it
         return None
+
+
+def check_if_augmented(data_path: pathlib.Path) -> None:
+    """Do `check_folder` where the metadata says that the folder is an augmented dataset's."""
+    if MinariStorage.read_raw_metadata(data_path).get("data_format") == DATA_FORMAT:
+        check_folder(data_path)
 
 
 def check_folder(data_path: pathlib.Path) -> None:

@@ -55,7 +55,13 @@ class Source:
 
         A key of the user's that is also one of ours (`METADATA_KEYS`) is renamed to `original_<key>`, with a warning.
         """
-        metadata = tuple(self.dataset.storage.get_episode_metadata(self.ids))
+        try:
+            metadata = tuple(self.dataset.storage.get_episode_metadata(self.ids))
+        except (KeyError, FileNotFoundError) as error:
+            raise InvalidDataError(
+                f"The dataset {self.dataset.id!r} claims {self.dataset.storage.total_episodes} episodes, and one of "
+                f"them is missing ({error}): it is damaged."
+            ) from error
         clashes = {key for part in metadata if not has_provenance(part) for key in METADATA_KEYS if key in part}
         if not clashes:
             return metadata

@@ -11,6 +11,7 @@ import copy
 import dataclasses
 import itertools
 import json
+import logging
 import os
 import pathlib
 import shutil
@@ -27,19 +28,18 @@ from minari.dataset._storages import _registry  # pyright: ignore[reportPrivateU
 from minari.dataset.minari_dataset import MinariDatasetSpec
 from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
 
+from oat_gym._staging import owned_folder
 from oat_gym.augmenters.base import Variation
 from oat_gym.cache import write_atomically
 from oat_gym.episodes import copy_episode
 from oat_gym.errors import InvalidDataError, SourceChangedError
 from oat_gym.provenance import Provenance, merge_spans
-from oat_gym.recipe import LIVE_RECIPE, RECIPE_FILE, open_recipe
+from oat_gym.recipe import APPENDED, DATA_FORMAT, EPISODE_METADATA_FILE, LIVE_RECIPE, RECIPE_FILE, open_recipe
 from oat_gym.serialization import metadata_to_json, source_metadata
 from oat_gym.source import Source
 from oat_gym.synthesis import Synthesis
 
-DATA_FORMAT = "oat"
-APPENDED = "appended"
-EPISODE_METADATA_FILE = "episode_metadata.json"
+_log = logging.getLogger(__name__)
 
 # Minari re-opens a dataset by its path (split_dataset, spec.data_path): within a process the same plan answers.
 _live: weakref.WeakValueDictionary[str, Synthesis] = weakref.WeakValueDictionary()
@@ -74,7 +74,7 @@ class AugmentedStorage(MinariStorage):
     @classmethod
     def of(cls, synthesis: Synthesis) -> AugmentedStorage:
         """Return the storage of a new augmented dataset, in a temporary directory that goes with it."""
-        path = pathlib.Path(tempfile.mkdtemp(prefix="oat_gym-"))
+        path = owned_folder("oat_gym-", pathlib.Path(tempfile.gettempdir()))
         write_metadata(path, synthesis)
         write_atomically(path / RECIPE_FILE, json.dumps(LIVE_RECIPE).encode())
         _attach(path, synthesis, owned=True)
@@ -204,6 +204,16 @@ class AugmentedStorage(MinariStorage):
         }
         self.update_metadata({**totals, "dataset_size": self.get_size()})
 
+    def update_metadata(self, metadata: dict[str, Any]) -> None:
+        """Add or change metadata of the dataset, as Minari does, but atomically: a crash leaves the old file whole."""
+        path = self.data_path / METADATA_FILE_NAME
+        with tempfile.TemporaryDirectory(prefix="oat_gym_metadata") as folder:
+            draft = AugmentedStorage.__new__(AugmentedStorage)  # Minari's method needs a path and no more
+            draft._data_path = pathlib.Path(folder)
+            shutil.copyfile(path, draft.data_path / METADATA_FILE_NAME)
+            MinariStorage.update_metadata(draft, metadata)
+            write_atomically(path, (draft.data_path / METADATA_FILE_NAME).read_bytes())
+
     def edited_metadata(self) -> dict[str, dict[str, Any]]:
         """Return the metadata added by `update_episode_metadata`, by the number of the episode as a string."""
         path = self.data_path / EPISODE_METADATA_FILE
@@ -228,9 +238,13 @@ class AugmentedStorage(MinariStorage):
         appended = self._appended_storage() if (self.data_path / APPENDED).exists() else None
         episodes = self.n_planned + (appended.total_episodes if appended else 0)
         claimed = (self.total_episodes, self.total_steps)
-        if claimed[0] == episodes:
+        if self.n_planned <= claimed[0] <= episodes:
             steps = int(synthesis.lengths.sum()) + (appended.total_steps if appended else 0)
-            if claimed[1] == steps:
+            if claimed == (episodes, steps):
+                return
+            if appended is not None and claimed[1] < steps:
+                _log.warning("%s: an append was cut off; its episodes are counted now.", self.data_path)
+                self.update_metadata({"total_episodes": episodes, "total_steps": steps})
                 return
         raise SourceChangedError(
             f"The metadata at {self.data_path} says {claimed[0]} episodes and {claimed[1]} steps, which is not what "

@@ -47,11 +47,11 @@ from oat_gym.cache import fingerprint
 from oat_gym.errors import ConfigurationError, DatasetExistsError
 from oat_gym.export import check_dataset_id, new_dataset_folder, write_dataset
 from oat_gym.io import _d4rl_note as notes
+from oat_gym.io._cached_dataset import cached_dataset
 from oat_gym.io._d4rl_columns import columns_of, kept_metadata
 from oat_gym.io._d4rl_cut import CutAt, cut, doubly_flagged, found_stops, noted_stops
 from oat_gym.io._d4rl_file import Flat, flatten_mapping, read_flat, write_flat
 from oat_gym.io._d4rl_rows import array_space, rows_of, spaces_of
-from oat_gym.io._cached_dataset import cached_dataset
 from oat_gym.io.writing import DatasetCard
 from oat_gym.serialization import metadata_to_json, source_metadata
 

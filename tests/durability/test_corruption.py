@@ -18,8 +18,8 @@ from minari import EpisodeData
 from oat_gym import OAT, AugmentedDataset, Function
 from oat_gym.cache import CacheWarning, cache_folder
 from oat_gym.episodes import content_hash
-from oat_gym.errors import CacheError, DatasetExistsError
-from oat_gym.export import SaveError, new_dataset_folder
+from oat_gym.errors import CacheError, DatasetExistsError, SaveError
+from oat_gym.export import new_dataset_folder
 
 
 def noisy(episode: EpisodeData, rng: np.random.Generator) -> EpisodeData:
