@@ -10,7 +10,7 @@ Importing the package teaches Minari the data format "oat" (see `oat_gym.dataset
 
 import importlib.metadata
 
-from oat_gym import domains, mining
+from oat_gym import checks, domains, mining
 from oat_gym.augmenters import AUGMENTERS, Augmenter, Function
 from oat_gym.augmenters.oat import OAT
 from oat_gym.dataset import AugmentedDataset, augment, install
@@ -41,6 +41,7 @@ __all__ = [
     "TorchLoader",
     "Transitions",
     "augment",
+    "checks",
     "domains",
     "mining",
     "read_d4rl",

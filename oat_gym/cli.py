@@ -27,7 +27,7 @@ from oat_gym.generation import VAEMDPConfig
 from oat_gym.mining import MiningConfig, MiningResult
 from oat_gym.progress import progress_bar
 from oat_gym.recipe import find_dataset
-from oat_gym.report import DatasetSummary, GroupSummary, summarize
+from oat_gym.report import DatasetSummary, GroupSummary, real_episodes, summarize
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False)
 cache_app = typer.Typer(no_args_is_help=True, help="What the cache holds, and emptying it.")
@@ -56,14 +56,22 @@ def main() -> None:
     """Run the command line: status 0 when it went well, 2 with one line on bad input, 130 when interrupted."""
     logging.basicConfig(level=logging.WARNING, format="oat-gym: %(message)s", stream=sys.stderr)
     warnings.simplefilter("ignore", DeprecationWarning)
+    warnings.showwarning = lambda message, *_: _complain(str(message))
     try:
-        app()
-    except OatGymError as error:
-        print(f"oat-gym: {' '.join(str(error).split())}", file=sys.stderr)
+        app(sys.argv[1:] or ["--help"], standalone_mode=False)
+    except (OatGymError, OSError) as error:
+        _complain(str(error))
+        sys.exit(2)
+    except typer.BadParameter.__base__ as error:  # the base of all wrong arguments; typer gives it no public name
+        _complain(error.format_message())
         sys.exit(2)
     except KeyboardInterrupt:
         print("oat-gym: interrupted; what was finished is kept.", file=sys.stderr)
         sys.exit(130)
+
+
+def _complain(message: str) -> None:
+    print(f"oat-gym: {' '.join(message.split())}", file=sys.stderr)
 
 
 @app.callback()
@@ -91,9 +99,13 @@ def demo(
     """
     os.environ["MINARI_DATASETS_PATH"] = str((folder / "datasets").resolve())
     data = AugmentedDataset(maze2d.umaze(), DEMO_CONFIG, factor=factor, seed=seed)
+    if len(data) == len(data.source):
+        raise ConfigurationError(f"The demo shows synthetic episodes: --factor must be more than 1, got {factor:g}.")
+    saved = _saved_demo(data)
     with progress_bar() as progress:
         data.fit(progress=progress)
-        _save_demo(data)
+        if not saved:
+            data.save(DEMO_ID)
         picture = folder / "figure4.png"
         progress("Drawing", 0, 1)
         draw_figure4(data, picture)
@@ -122,9 +134,11 @@ def augment(
     target = dataset_id or f"{source.spec.namespace or 'oat_gym'}/{source.spec.dataset_name}-{augmenter}-v0"
     data = AugmentedDataset(source, _configure(augmenter, length, top), factor=factor, seed=seed)
     check_dataset_id(target)
-    with progress_bar() as progress:
-        data.fit(progress=progress)
-    saved = data.save(target, data_format=_data_format(data_format), lazy=lazy)
+    chosen = _data_format(data_format)
+    if not lazy:
+        with progress_bar() as progress:
+            data.fit(progress=progress)
+    saved = data.save(target, data_format=chosen, lazy=lazy)
     out.print(f"{target}: {len(data.source)} real + {len(data) - len(data.source)} synthetic episodes.")
     out.print(f"Stored in {saved.storage.data_path}; load it with minari.load_dataset({target!r}).")
 
@@ -140,13 +154,13 @@ def inspect(
     """Show spaces, lengths, returns, supports, PST sets and seam jumps of DATASET, real or augmented."""
     data = open_source(dataset)
     _print_summary(summarize(data))
-    if isinstance(data, AugmentedDataset) and data.synthesis.sampler.mining is not None:
+    if isinstance(data, AugmentedDataset) and data.synthesis.count and data.synthesis.sampler.mining is not None:
         _print_mining(data.mining, len(data.source))
     elif mine:
-        config = _mining_config(length, top)
+        real = real_episodes(data)
         with progress_bar() as progress:
-            result = OAT(mining=config).mine(data, seed=seed, progress=progress)
-        _print_mining(result, len(data))
+            result = OAT(mining=_mining_config(length, top)).mine(real, seed=seed, progress=progress)
+        _print_mining(result, len(real))
 
 
 @cache_app.command("list")
@@ -207,13 +221,15 @@ def draw_figure4(data: AugmentedDataset, path: Path) -> None:
     )
 
 
-def _save_demo(data: AugmentedDataset) -> None:
+def _saved_demo(data: AugmentedDataset) -> bool:
+    """Return whether an earlier run saved the same dataset; another one in its place is an error."""
     try:
-        data.save(DEMO_ID)
+        check_dataset_id(DEMO_ID)
     except DatasetExistsError:
-        made = find_dataset(DEMO_ID).storage.metadata.get("oat_gym")
-        if made != data.description():
+        if find_dataset(DEMO_ID).storage.metadata.get("oat_gym") != data.description():
             raise
+        return True
+    return False
 
 
 def _configure(name: str, length: str, top: int) -> Augmenter:
@@ -226,7 +242,7 @@ def _configure(name: str, length: str, top: int) -> Augmenter:
 
 
 def _mining_config(length: str, top: int) -> MiningConfig:
-    if length != "auto" and not length.isdigit():
+    if length != "auto" and not length.isdecimal():
         raise ConfigurationError(f'--length must be a number of steps or "auto", got {length!r}.')
     return MiningConfig(n_clusters="auto", length="auto" if length == "auto" else int(length), top=top)
 
@@ -271,10 +287,12 @@ def _summary_rows(groups: list[GroupSummary]) -> list[tuple[str, list[str]]]:
 def _print_mining(mining: MiningResult, n_episodes: int) -> None:
     out.print(f"Clusters: {mining.n_clusters}. Sub-trajectories of W = {mining.length} steps; support is the number of")
     out.print(f"episodes, of {n_episodes}, that contain the same sequence of clusters.")
+    if mining.n_too_short:
+        out.print(f"{mining.n_too_short} episodes have fewer than {mining.length} steps and hold no sub-trajectory.")
     table = Table(box=None, pad_edge=False, header_style="")
     for column in ("PST set", "support", "share", "occurrences", "clusters in order"):
         table.add_column(column, justify="left" if column.startswith("clusters") else "right")
-    for number, pst in enumerate(mining.sets, start=1):
+    for number, pst in enumerate(mining.sets):
         share = f"{pst.support / n_episodes:.0%}"
         table.add_row(str(number), str(pst.support), share, str(len(pst.occurrences)), _runs(pst.labels))
     out.print(table)

@@ -45,5 +45,9 @@ class SourceChangedError(OatGymError, RuntimeError):
     """A recipe's source no longer has the content that it was made from."""
 
 
+class AugmentationWarning(UserWarning):
+    """The augmented dataset is sound, but less was generated than its size suggests."""
+
+
 class ConformanceError(OatGymError, AssertionError):
     """A dataset, augmenter or estimator broke its contract (see `oat_gym.checks`)."""

@@ -24,7 +24,7 @@ from minari.storage import get_dataset_path
 from oat_gym._staging import owned_folder
 from oat_gym.cache import write_atomically
 from oat_gym.episodes import plain_infos
-from oat_gym.errors import ConfigurationError, DatasetExistsError, OatGymError, SaveError
+from oat_gym.errors import ConfigurationError, DatasetExistsError, InvalidDataError, OatGymError, SaveError
 from oat_gym.serialization import metadata_to_json
 from oat_gym.spaces import map_tree, tree_length
 
@@ -49,6 +49,10 @@ _STAGING = ".oat_gym-"
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 _ERRNO = re.compile(r"errno = (\d+)")  # how HDF5 tells it in its messages
 
+INFOS_ROWS = "infos_rows"
+"""Key of an episode's metadata: how many rows of its infos were recorded, where a first one was added to them."""
+
+_ARROW_ROWS = 32_767  # Minari's arrow reader gives no more rows of an episode than that, and says nothing
 _BATCH_BYTES = 64_000_000
 _EPISODE_OVERHEAD, _LEAF_OVERHEAD = 4_000, 500  # what HDF5 adds, at most, for attributes and for each array
 
@@ -103,7 +107,7 @@ def new_dataset_folder(dataset_id: str) -> Generator[Path]:
         yield folder / "data"
         _publish(folder, path, dataset_id)
     except (OSError, RuntimeError, ValueError) as error:  # HDF5 tells a full disk by any of them
-        if _is_disk_error(error):
+        if is_disk_error(error):
             raise _save_error(dataset_id, error) from error
         raise
     finally:
@@ -131,6 +135,10 @@ def write_dataset(
 ) -> None:
     """Write episodes and their metadata as the dataset `dataset_id` into the empty folder `data_path`.
 
+    Minari's Arrow and Parquet storage takes infos of T+1 rows only (a row of the reset, then those of the steps).
+    Infos of T rows get a copy of their first row before them there, and the episode's metadata says so:
+    `infos_rows` is then T, the number of the last rows that were recorded.
+
     Args:
         data_path: the dataset's `data` folder.
         dataset_id: the id that the dataset will have.
@@ -139,6 +147,10 @@ def write_dataset(
         spaces: observation and action space.
         data_format: one of `DATA_FORMATS`.
         step_mask: gives, from an episode's metadata, T booleans to store as `infos["synthetic"]`; None stores none.
+
+    Raises:
+        InvalidDataError: for an episode that is too long for the format (`check_length`).
+        OSError: if the disk refuses.
     """
     data_path.rmdir()
     storage = MinariStorage.new(
@@ -152,18 +164,36 @@ def write_dataset(
 
     def buffers() -> Iterator[EpisodeBuffer]:
         for number, (episode, metadata) in enumerate(episodes):
-            kept.append(metadata)
+            length = len(episode.rewards)
+            check_length(number, length, data_format)
+            for_arrow = data_format != "hdf5"
             mask = None if step_mask is None else step_mask(metadata)
-            yield _buffer(number, episode, mask, for_arrow=data_format != "hdf5")
+            padded = INFOS_ROWS in metadata or (for_arrow and _has_leaf_of(episode.infos, length))
+            kept.append(metadata | {INFOS_ROWS: length} if padded else metadata)
+            yield _buffer(number, episode, mask, for_arrow=for_arrow)
 
     with _size_known_later(storage):
         for batch, size in _batches(buffers()):
-            _ensure_space(data_path, size)
+            ensure_space(data_path, size)
             storage.update_episodes(batch)
-        _ensure_space(data_path, len(kept) * _EPISODE_OVERHEAD)
+        ensure_space(data_path, len(kept) * _EPISODE_OVERHEAD)
         storage.update_episode_metadata([_storable(metadata, data_format) for metadata in kept], range(len(kept)))
     _write_common_metadata(data_path, dataset_id, like)
     storage.update_metadata({"dataset_size": float(storage.get_size())})
+
+
+def check_length(number: int, length: int, data_format: DataFormat) -> None:
+    """Check that an episode of `length` steps can be read back from a data format.
+
+    Raises:
+        InvalidDataError: if Minari would cut it without a word: Arrow and Parquet give at most 32,767 rows back.
+    """
+    if data_format != "hdf5" and length + 1 > _ARROW_ROWS:
+        raise InvalidDataError(
+            f"Episode {number} has {length} steps ({length + 1} observations), and Minari reads at most {_ARROW_ROWS} "
+            f"rows of an episode back from data_format={data_format!r}: the rest would be lost. Save it with "
+            "data_format='hdf5'."
+        )
 
 
 def _batches(buffers: Iterable[EpisodeBuffer]) -> Iterator[tuple[list[EpisodeBuffer], int]]:
@@ -172,12 +202,17 @@ def _batches(buffers: Iterable[EpisodeBuffer]) -> Iterator[tuple[list[EpisodeBuf
     size = 0
     for buffer in buffers:
         batch.append(buffer)
-        size += _EPISODE_OVERHEAD + sum(_stored_bytes(part) for part in vars(buffer).values())
+        size += buffer_bytes(buffer)
         if size > _BATCH_BYTES:
             yield batch, size
             batch, size = [], 0
     if batch:
         yield batch, size
+
+
+def buffer_bytes(buffer: EpisodeBuffer) -> int:
+    """Return the bytes that a buffer may take on disk."""
+    return _EPISODE_OVERHEAD + sum(_stored_bytes(part) for part in vars(buffer).values())
 
 
 def _stored_bytes(part: Any) -> int:
@@ -190,14 +225,18 @@ def _stored_bytes(part: Any) -> int:
     return 4 * len(part) + 16 if isinstance(part, str) else 16
 
 
-def _ensure_space(folder: Path, needed: int) -> None:
-    """Raise OSError where `needed` bytes do not fit: HDF5 that meets a full disk half-way can crash the interpreter."""
+def ensure_space(folder: Path, needed_bytes: int) -> None:
+    """Check that `needed_bytes` fit in a folder: HDF5 that meets a full disk half-way can crash the interpreter.
+
+    Raises:
+        OSError: if they do not, or the folder cannot be written.
+    """
     if hasattr(os, "posix_fallocate"):
         with tempfile.TemporaryFile(dir=folder) as probe, _unsupported_is_fine():
-            os.posix_fallocate(probe.fileno(), 0, needed)
+            os.posix_fallocate(probe.fileno(), 0, needed_bytes)
     free = shutil.disk_usage(folder).free
-    if free < needed:
-        raise OSError(errno.ENOSPC, f"about {needed / 1e6:.1f} MB are needed and {free / 1e6:.1f} MB are free")
+    if free < needed_bytes:
+        raise OSError(errno.ENOSPC, f"about {needed_bytes / 1e6:.1f} MB are needed and {free / 1e6:.1f} MB are free")
 
 
 @contextlib.contextmanager
@@ -237,6 +276,13 @@ def _arrow_info(leaf: Any, length: int) -> Any:
         leaf = np.concatenate([leaf[:1], leaf]) if len(leaf) == length else leaf
         return list(leaf) if leaf.ndim == 1 else leaf
     return [*leaf[:1], *leaf] if len(leaf) == length else leaf
+
+
+def _has_leaf_of(infos: Any, rows: int) -> bool:
+    infos = plain_infos(infos)
+    if isinstance(infos, dict):
+        return any(_has_leaf_of(part, rows) for part in infos.values())
+    return infos is not None and len(infos) == rows
 
 
 def _storable(metadata: dict[str, Any], data_format: str) -> dict[str, Any]:
@@ -301,7 +347,8 @@ def _save_error(dataset_id: str, error: Exception) -> SaveError:
     )
 
 
-def _is_disk_error(error: Exception) -> bool:
+def is_disk_error(error: Exception) -> bool:
+    """Return whether an exception tells that the disk refused (full, read-only, failing), HDF5's own ones included."""
     if isinstance(error, OatGymError):
         return False
     told = _ERRNO.search(str(error))

@@ -149,7 +149,7 @@ def figure4(
         trajectories(axes, rows, maze=maze, spans=members)
         _label_maze(axes, f"{title} ({len(rows)} trajectories)")
     panels[1].set_ylabel("")
-    labels = [f"PST set {i + 1} (support {count} of {len(original)})" for i, count in enumerate(counts)]
+    labels = [f"PST set {i} (support {count} of {len(original)})" for i, count in enumerate(counts)]
     _legend_below(figure, *_handles(labels))
     return _finish(figure, path)
 

@@ -104,7 +104,7 @@ def write_recipe(synthesis: Synthesis) -> bytes:
             augmenter that is the user's own code, or a setting that JSON does not give back.
     """
     augmenter, dataset = synthesis.augmenter, synthesis.source.dataset
-    if AUGMENTERS.get(augmenter.name) is not type(augmenter):
+    if AUGMENTERS.get(augmenter.name) is not type(augmenter) or not augmenter.cacheable:
         raise ConfigurationError(
             f"A recipe names a method of oat_gym.AUGMENTERS ({', '.join(AUGMENTERS)}), and {augmenter!r} is not one: "
             "save the episodes themselves (lazy=False)."

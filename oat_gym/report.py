@@ -77,6 +77,13 @@ def summarize(dataset: MinariDataset) -> DatasetSummary:
     )
 
 
+def real_episodes(dataset: MinariDataset) -> MinariDataset:
+    """Return the view of the episodes that their metadata does not call synthetic."""
+    metadata = dataset.storage.get_episode_metadata(dataset.episode_indices)
+    kept = [not Provenance.from_metadata(part, number).synthetic for number, part in enumerate(metadata)]
+    return MinariDataset(dataset.storage, episode_indices=np.asarray(dataset.episode_indices)[kept])
+
+
 def _group(
     origins: list[Provenance], returns: npt.NDArray[np.float64], chosen: npt.NDArray[np.bool_]
 ) -> GroupSummary | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -52,13 +53,21 @@ def stitch(episode: EpisodeData, span: Span, replacement: Replacement) -> Episod
     Raises:
         ConfigurationError: if the span lies outside the episode or the replacement has another length.
     """
-    stitched = copy_episode(episode, number=episode.id)
+    stitched = stitchable_copy(episode, number=episode.id)
     stitch_into(stitched, span, replacement)
     return stitched
 
 
+def stitchable_copy(episode: EpisodeData, *, number: int) -> EpisodeData:
+    """Return a copy that generated steps can go into: integer rewards become floats, which generated ones are."""
+    stitched = copy_episode(episode, number=number)
+    if stitched.rewards.dtype.kind in "biu":
+        stitched = dataclasses.replace(stitched, rewards=stitched.rewards.astype(np.float64))
+    return stitched
+
+
 def stitch_into(episode: EpisodeData, span: Span, replacement: Replacement) -> None:
-    """Do what `stitch` does on an episode that the caller owns, in place."""
+    """Do what `stitch` does in place, on an episode that `stitchable_copy` gave."""
     width = span.stop - span.start
     if not 0 <= span.start < span.stop <= len(episode.rewards):
         raise ConfigurationError(f"The span {span.start}:{span.stop} is not inside 0:{len(episode.rewards)}.")

@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import minari
@@ -10,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from oat_gym import OAT, AugmentedDataset, cli
+from oat_gym.errors import AugmentationWarning
 from oat_gym.generation import BehaviorConfig, VAEMDPConfig
 
 
@@ -36,6 +38,11 @@ def test_help(command: list[str]) -> None:
         (["augment", "maze2d-umaze", "--format", "csv"], "--format"),
         (["augment", "maze2d-umaze", "--out", "no id"], "is no dataset id"),
         (["augment", "maze2d-umaze", "--top", "0"], "top must be"),
+        (["augment", "maze2d-umaze", "--factor", "ten"], "'ten' is not a valid float"),
+        (["augment", "maze2d-umaze", "--length", "\u00b2"], "--length"),
+        (["augment"], "Missing argument"),
+        (["magic"], "No such command"),
+        (["demo", "--factor", "1"], "--factor must be more than 1"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments: list[str], message: str, tmp_path: Path) -> None:
@@ -76,6 +83,7 @@ def test_demo_writes_one_folder_and_runs_twice(tmp_path: Path, monkeypatch: pyte
     mining = dataclasses.replace(cli.DEMO_CONFIG.mining, n_clusters=4, init="kmeans")
     monkeypatch.setattr(cli, "DEMO_CONFIG", dataclasses.replace(cli.DEMO_CONFIG, mining=mining, **small))
     monkeypatch.chdir(tmp_path)
+    warnings.simplefilter("ignore", AugmentationWarning)  # short episodes hold no PST
     for _ in range(2):
         result = CliRunner().invoke(cli.app, ["demo", "--factor", "2"])
         assert result.exit_code == 0, result.output

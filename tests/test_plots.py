@@ -55,7 +55,7 @@ def test_figure4_has_two_panels_on_one_scale_and_a_legend_with_supports(tmp_path
     assert left.get_xlim() == right.get_xlim()
     np.testing.assert_allclose(lines(right)[2].get_segments()[0], augmented[1][3:8])
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert texts == ["PST set 1 (support 2 of 3)", "PST set 2 (support 1 of 3)", "rest of the trajectories"]
+    assert texts == ["PST set 0 (support 2 of 3)", "PST set 1 (support 1 of 3)", "rest of the trajectories"]
     assert file.read_bytes().startswith(b"\x89PNG")
 
 
@@ -64,7 +64,7 @@ def test_figure4_takes_more_augmented_trajectories_with_their_own_spans():
     spans = [[(3, 0, 2), (5, 1, 5)], [(4, 3, 7), (1, 0, 1)]]
     figure = plots.figure4(WALKS, augmented, maze=UMAZE.walls(), spans=SPANS, augmented_spans=spans, supports=[3, 2])
     assert [len(item.get_segments()) for item in lines(figure.axes[1])] == [6, 2, 2]
-    assert figure.legends[0].get_texts()[0].get_text() == "PST set 1 (support 3 of 3)"
+    assert figure.legends[0].get_texts()[0].get_text() == "PST set 0 (support 3 of 3)"
     with pytest.raises(ConfigurationError, match="spans has 2 sets, augmented_spans 1 and supports 2"):
         plots.figure4(WALKS, WALKS, maze=UMAZE.walls(), spans=SPANS, augmented_spans=spans[:1])
 

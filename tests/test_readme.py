@@ -13,6 +13,7 @@ README = (Path(__file__).parents[1] / "README.md").read_text()
 BLOCKS = re.findall(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
 
 
+@pytest.mark.filterwarnings("ignore:.*hold no window")  # the maze has a few very short episodes
 @pytest.mark.parametrize("block", BLOCKS, ids=[f"block{i}" for i in range(len(BLOCKS))])
 def test_block(block: str, monkeypatch: pytest.MonkeyPatch) -> None:
     # Short training: whether the lines are right does not depend on it.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,12 +16,13 @@ from oat_gym._rng import check_seed, derive
 from oat_gym.augmenters.base import Augmenter, Sampler, Variation
 from oat_gym.augmenters.spans import Occurrence, Placement, SpanSamples, place_spans, seam_jumps
 from oat_gym.cache import Arrays
-from oat_gym.episodes import copy_episode
-from oat_gym.errors import ConfigurationError, InvalidDataError
+from oat_gym.errors import AugmentationWarning, ConfigurationError, InvalidDataError
 from oat_gym.generation import (
+    ActionPolicy,
     BehaviorConfig,
     BehaviorModel,
     FittedVAEMDP,
+    Limits,
     Sequences,
     VAEMDPConfig,
     fit_behavior,
@@ -30,8 +32,8 @@ from oat_gym.mining import MiningConfig, MiningResult, mine
 from oat_gym.mining.state import mining_from_state, mining_to_state
 from oat_gym.progress import ProgressCallback, silent
 from oat_gym.source import Source
-from oat_gym.spaces import Batch
-from oat_gym.stitching import Seam, Span, literal_next_states, stitch_into
+from oat_gym.spaces import Batch, FlatSpace
+from oat_gym.stitching import Seam, Span, literal_next_states, stitch_into, stitchable_copy
 
 Start = Literal["prior", "posterior"]
 Actions = Literal["behavior", "recorded"]
@@ -49,6 +51,9 @@ class OAT(Augmenter):
         start: where a roll-out starts: z_1 from the "prior" N(0, I), as in the paper, or from the "posterior"
             q(z_1|s_1) of the span that it replaces.
         actions: "behavior": sampled from the cloned policy, as in the paper; "recorded": those of the span replaced.
+        policy: acts in the roll-outs in place of the clone, on batches of the dataset's spaces: an object with
+            `sample(observations, *, rng)` and `log_prob(observations, actions)`. The result is not kept in the cache,
+            since a policy has no fingerprint.
         observation_noise: draw states and rewards from their distributions, as in the paper, or (false) take their
             means: smoother states, since the paper's diagonal Gaussian p(s|z) adds independent noise to every step.
         seam: "contiguous" (Minari's form), "literal" (the paper's: tuples outside the span keep their own next state,
@@ -67,6 +72,7 @@ class OAT(Augmenter):
     behavior: BehaviorConfig = field(default_factory=BehaviorConfig)
     start: Start = "prior"
     actions: Actions = "behavior"
+    policy: ActionPolicy | None = None
     observation_noise: bool = True
     seam: Seam = "contiguous"
     candidates: int = 16
@@ -82,10 +88,25 @@ class OAT(Augmenter):
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
                 raise ConfigurationError(f"{name} must be one of {', '.join(allowed)}; got {getattr(self, name)!r}.")
+        parts = {"mining": MiningConfig, "model": VAEMDPConfig, "behavior": BehaviorConfig}
+        for name, kind in parts.items():
+            if not isinstance(getattr(self, name), kind):
+                raise ConfigurationError(f"{name} must be a {kind.__name__}, got {getattr(self, name)!r}.")
+        if not isinstance(self.observation_noise, bool):
+            raise ConfigurationError(f"observation_noise must be True or False, got {self.observation_noise!r}.")
+        if self.policy is not None and not isinstance(self.policy, ActionPolicy):
+            raise ConfigurationError(f"policy must have the methods sample and log_prob, got {self.policy!r}.")
+        if self.times is not None and not isinstance(self.times, str):
+            raise ConfigurationError(f"times must be a key of the infos or None, got {self.times!r}.")
         if isinstance(self.candidates, bool) or not isinstance(self.candidates, int) or self.candidates < 1:
             raise ConfigurationError(f"candidates must be an integer of at least 1, got {self.candidates!r}.")
         if self.features is not None and not (isinstance(self.features, tuple) and self.features):
             raise ConfigurationError(f"features must be a tuple of observation keys or None, got {self.features!r}.")
+
+    @property
+    def cacheable(self) -> bool:
+        """False with a policy of the user's."""
+        return self.policy is None
 
     @classmethod
     def preset(cls, preset: Literal["default", "paper"]) -> OAT:
@@ -110,6 +131,10 @@ class OAT(Augmenter):
         """Mine, clone the behaviour policy, and train one VAE-MDP for each PST set."""
         states, actions, rewards = source.state_matrices(), source.action_matrices(), source.rewards()
         mining = self._mine(source, seed=seed, progress=progress)
+        if not mining.sets:
+            raise InvalidDataError(
+                f"No window reaches the support asked for, so there is nothing to augment.\n{mining!r}"
+            )
         behavior = fit_behavior(
             np.concatenate([rows[:-1] for rows in states]),
             np.concatenate(actions),
@@ -158,8 +183,9 @@ class OAT(Augmenter):
         return mine(series, config=self.mining, times=times, rng=derive(seed, "mining"), progress=progress)
 
     def restore(self, source: Source, arrays: Arrays, value: Any, *, seed: int) -> OATSampler:
-        """Return the sampler that `OATSampler.state` described."""
+        """Return the sampler that `OATSampler.state` described; warns of episodes that it can only copy."""
         mining = mining_from_state(_with_prefix(arrays, "mining/"), value["mining"])
+        _warn_of_copies(mining, len(source))
         behavior = BehaviorModel.from_arrays(_with_prefix(arrays, "behavior/"), config=self.behavior)
         models = [
             FittedVAEMDP.from_arrays(_with_prefix(arrays, f"model{g}/"), config=self.model, name=f"PST set {g}")
@@ -235,7 +261,8 @@ class OATSampler(Sampler):
         samples = self._models[g].sample(
             len(rows) * repeats,
             rng=derive(self._seed, "sample", g, k),
-            policy=self._behavior,
+            policy=self._policy,
+            limits=self._limits,
             actions=actions,
             start=config.start,
             observation_noise=config.observation_noise,
@@ -245,6 +272,24 @@ class OATSampler(Sampler):
         best = jumps.sum(axis=1).reshape(len(rows), repeats).argmin(axis=1) + np.arange(len(rows)) * repeats
         drawn = {name: getattr(samples, name)[best] for name in ("states", "actions", "rewards", "log_prob")}
         return drawn | {"rows": np.array(rows), "seams": jumps[best]}
+
+    @property
+    def _policy(self) -> ActionPolicy:
+        if self._config.policy is None:
+            return self._behavior
+        return _FlatPolicy(self._config.policy, self._source.flat_observations, self._source.flat_actions)
+
+    @cached_property
+    def _limits(self) -> Limits:
+        """The range of all recorded values, wider by the model's margin and inside the spaces' bounds."""
+        return Limits.of(
+            np.concatenate(self._states),
+            np.concatenate(self._action_matrices),
+            np.concatenate(self._source.rewards()),
+            margin=self._config.model.range_margin,
+            state_bounds=self._source.flat_observations.bounds,
+            action_bounds=self._source.flat_actions.bounds,
+        )
 
     @cached_property
     def _action_matrices(self) -> list[npt.NDArray[np.float64]]:
@@ -259,14 +304,14 @@ class OATSampler(Sampler):
     def variation(self, i: int, k: int, material: dict[int, SpanSamples]) -> Variation:
         """Stitch the samples of variation `k` into a copy of source episode `i`."""
         original = self._source.episodes[i]
-        episode = copy_episode(original, number=i)
+        episode = stitchable_copy(original, number=i)
         spans: list[Span] = []
         before: dict[int, Batch] = {}
         last: dict[int, Batch] = {}
         for g, samples in material.items():
             if i not in samples.row_of:
                 continue
-            span, replacement = samples.replacement(i, pst_set=g, k=k)
+            span, replacement = samples.replacement(i, pst_set=g, number=k * len(self._source) + i)
             stitch_into(episode, span, replacement)
             spans.append(span)
             if self._config.seam == "literal":
@@ -275,6 +320,37 @@ class OATSampler(Sampler):
                 last |= generated
         spans.sort(key=lambda span: span.start)
         return Variation(episode, tuple(spans), before | last)
+
+
+@dataclass(frozen=True)
+class _FlatPolicy:
+    """A policy on batches of the dataset's spaces, as one on feature matrices."""
+
+    policy: ActionPolicy
+    observations: FlatSpace
+    actions: FlatSpace
+
+    def sample(
+        self, observations: npt.NDArray[np.floating[Any]], *, rng: np.random.Generator
+    ) -> npt.NDArray[np.floating[Any]]:
+        return self.actions.flatten(self.policy.sample(self.observations.unflatten(observations), rng=rng))
+
+    def log_prob(
+        self, observations: npt.NDArray[np.floating[Any]], actions: npt.NDArray[np.floating[Any]]
+    ) -> npt.NDArray[np.floating[Any]]:
+        return self.policy.log_prob(self.observations.unflatten(observations), self.actions.unflatten(actions))
+
+
+def _warn_of_copies(mining: MiningResult, n_source: int) -> None:
+    with_pst = {int(i) for pst in mining.sets for i in pst.occurrences[:, 0]}
+    if len(with_pst) < n_source:
+        warnings.warn(
+            f"{n_source - len(with_pst)} of {n_source} episodes hold no window of the PST sets (W={mining.length}; "
+            f"{mining.n_too_short} episodes are shorter): their synthetic episodes are exact copies of them. A smaller "
+            "length, fewer clusters or more sets (top) reach more episodes.",
+            AugmentationWarning,
+            stacklevel=2,
+        )
 
 
 def _with_prefix(arrays: Arrays, prefix: str) -> Arrays:

@@ -79,12 +79,12 @@ class SpanSamples:
             seams=arrays["seams"],
         )
 
-    def replacement(self, i: int, *, pst_set: int, k: int) -> tuple[Span, Replacement]:
-        """Return the span of episode `i` and what goes into it (views of the samples)."""
+    def replacement(self, i: int, *, pst_set: int, number: int) -> tuple[Span, Replacement]:
+        """Return the span of episode `i`, its sample called `number`, and what goes into it (views of the samples)."""
         row = self.row_of[i]
         start, width = int(self.starts[row]), self.rewards.shape[1]
         seam = float(self.seams[row, 0]), float(self.seams[row, 1])
-        span = Span(start, start + width, pst_set=pst_set, sample=k * len(self.starts) + row, seam=seam)
+        span = Span(start, start + width, pst_set=pst_set, sample=number, seam=seam)
         parts = (map_tree(lambda leaf: leaf[row], batch) for batch in (self.observations, self.actions))
         return span, Replacement(*parts, rewards=self.rewards[row])
 

@@ -6,6 +6,8 @@ import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,10 @@ from gymnasium import spaces
 from minari import EpisodeData, MinariDataset
 
 from oat_gym.episodes import BoolArray, IntArray, check_episode, hash_episode
-from oat_gym.errors import InvalidDataError, UnsupportedSpaceError
+from oat_gym.errors import ConfigurationError, InvalidDataError, UnsupportedSpaceError
+from oat_gym.io.d4rl import is_d4rl_path, read_d4rl
 from oat_gym.provenance import Provenance
+from oat_gym.recipe import find_dataset
 from oat_gym.spaces import Batch, FlatSpace, get_leaf, iter_leaf_spaces, map_tree
 from oat_gym.storage import AugmentedStorage
 
@@ -26,6 +30,9 @@ PADDING = {"episode": -1, "step": -1}
 """What the padding row holds where it does not hold zeros."""
 
 Named = dict[str, npt.NDArray[Any]]
+
+DataSource = MinariDataset | str | PathLike[str]
+"""A Minari dataset, the id of an installed or embedded one, or the path of a D4RL HDF5 file."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +160,22 @@ class Layout:
         if np.issubdtype(array.dtype, np.unsignedinteger) and array.dtype.itemsize > 1:
             return _signed(array)  # torch has few operations for unsigned integers wider than a byte
         return array
+
+
+def open_source(data: DataSource) -> MinariDataset:
+    """Return the dataset that a consumer is to read.
+
+    Raises:
+        DatasetNotFoundError: if it is not on this machine; nothing is downloaded.
+        ConfigurationError: if it is no dataset, id of one, or path of a D4RL HDF5 file.
+    """
+    if isinstance(data, str | PathLike):
+        data = read_d4rl(data) if is_d4rl_path(data) else find_dataset(str(data))
+    if not isinstance(data, MinariDataset):
+        raise ConfigurationError(
+            f"A Minari dataset, the id of one, or the path of a D4RL HDF5 file is needed, got {data!r}."
+        )
+    return data
 
 
 def column_name(role: str, path: tuple[str | int, ...]) -> str:

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from oat_gym.errors import DatasetExistsError, DatasetNotFoundError, InvalidDataError
+from oat_gym.errors import DatasetExistsError, DatasetNotFoundError, InvalidDataError, OatGymError, SaveError
 
 Array = npt.NDArray[Any]
 Value = Array | list[str] | str
@@ -21,6 +21,7 @@ Value = Array | list[str] | str
 Flat = dict[str, Value]
 
 _MAX_DEPTH = 16
+_BLOCK_BYTES = 1 << 20
 
 
 def read_flat(path: Path) -> Flat:
@@ -69,16 +70,36 @@ def write_flat(path: Path, values: Mapping[str, Value]) -> None:
 
     Raises:
         DatasetExistsError: if `path` exists.
-        OSError: if the disk refuses.
+        SaveError: if the disk refuses.
     """
+    image = _image(values)
+    try:
+        _write_bytes(path, image)
+    except OatGymError:
+        raise
+    except OSError as error:
+        raise SaveError(
+            f"{path} could not be written ({error}); nothing of it was left there. Free some space, or name a file in "
+            "a folder that can be written."
+        ) from error
+
+
+def _image(values: Mapping[str, Value]) -> bytes:
+    # In memory: HDF5 that meets a full disk can crash the interpreter.
+    with h5py.File("image", "w", driver="core", backing_store=False, block_size=_BLOCK_BYTES) as file:
+        for key, value in values.items():
+            _write_value(file, key, value)
+        file.flush()
+        return file.id.get_file_image()
+
+
+def _write_bytes(path: Path, data: bytes) -> None:
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
     temporary = Path(name)
     try:
-        with h5py.File(temporary, "w") as file:
-            for key, value in values.items():
-                _write_value(file, key, value)
-        with temporary.open("rb") as file:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
             os.fsync(file.fileno())
         temporary.chmod(0o644)  # mkstemp keeps others out, which a data file should not
         _publish(temporary, path)

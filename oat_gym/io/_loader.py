@@ -69,6 +69,7 @@ class TorchLoader:
         self._started = -1  # the last epoch that an iteration began
         self._next = (0, 0)  # epoch and batch that follow the last batch given out
         self._resume = False
+        self._kept: tuple[int, torch.Tensor] | None = None  # the last epoch whose order was drawn, and that order
 
     def __len__(self) -> int:
         """Return the number of batches of an epoch."""
@@ -89,8 +90,15 @@ class TorchLoader:
         return self._epoch(epoch, first)
 
     def batches(self, count: int) -> Iterator[TorchBatch]:
-        """Yield the next `count` batches from where the last one ended, over as many epochs as that takes."""
+        """Return an iterator over the next `count` batches, from where the last one ended, into further epochs too.
+
+        Raises:
+            ConfigurationError: for a count below 1.
+        """
         check_count("count", count)
+        return self._batches(count)
+
+    def _batches(self, count: int) -> Iterator[TorchBatch]:
         while count:
             epoch, first = self._next
             self._started, self._resume = epoch, False
@@ -107,23 +115,34 @@ class TorchLoader:
         """Go on from `state`, which a loader of the same data and settings gave.
 
         Raises:
-            ConfigurationError: if the state is of another version, other data or other settings.
+            ConfigurationError: if the state is of another version, other data or other settings, or names no place.
         """
         if state.get("version") != STATE_VERSION or state.get("loader") != self._fingerprint():
             raise ConfigurationError(
                 "The state is not one of this loader: data, settings or library differ, so the remaining batches would "
                 f"not be the same ones. Make the loader as it was when the state was saved; got {state!r}."
             )
-        self._next = (int(state["epoch"]), int(state["batch"]))
+        epoch, batch = state.get("epoch"), state.get("batch")
+        if type(epoch) is not int or type(batch) is not int or epoch < 0 or not 0 <= batch < len(self):
+            raise ConfigurationError(
+                f"The state names batch {batch!r} of epoch {epoch!r}; expected an epoch of at least 0 and one of the "
+                f"{len(self)} batches, counted from 0. Load a state that `state_dict` gave."
+            )
+        self._next = (epoch, batch)
         self._resume = True
 
     def _epoch(self, epoch: int, first: int) -> Iterator[TorchBatch]:
-        order = torch.from_numpy(self._order(epoch)).to(self._home)
+        order = self._order_of(epoch)
         size = self.config.batch_size
         for number in range(first, len(self)):
             batch = self._deliver(gather(self.columns, self._items, order[number * size : (number + 1) * size]))
             self._next = (epoch, number + 1) if number + 1 < len(self) else (epoch + 1, 0)
             yield batch
+
+    def _order_of(self, epoch: int) -> torch.Tensor:
+        if self._kept is None or self._kept[0] != epoch:
+            self._kept = (epoch, torch.from_numpy(self._order(epoch)).to(self._home))
+        return self._kept[1]
 
     def _order(self, epoch: int) -> IntArray:
         n = len(self._items)

@@ -21,6 +21,7 @@ from filelock import FileLock
 from minari import MinariDataset
 
 from oat_gym.cache import fingerprint, write_atomically
+from oat_gym.errors import OatGymError, SaveError
 from oat_gym.io._columns import Columns, Layout, assemble, hash_parts, read_parts, write_columns
 
 VERSION = 1
@@ -35,9 +36,8 @@ def columns_on_disk(data: MinariDataset, layout: Layout, folder: Path) -> Column
     The files are opened copy-on-write: nothing that is done to a batch or a column reaches the disk.
 
     Raises:
-        OSError: if the folder cannot be written, or the disk is full; nothing incomplete stays under its final name.
+        SaveError: if the folder cannot be written, or the disk is full; nothing incomplete stays under its final name.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     key = fingerprint(
         torch_columns=VERSION,
         content=hash_parts(read_parts(data)),
@@ -45,14 +45,27 @@ def columns_on_disk(data: MinariDataset, layout: Layout, folder: Path) -> Column
         flat=layout.flat,
         dtype=str(layout.dtype),
     )
-    target = folder / key
-    with FileLock(folder / f".{key}.lock"):
+    try:
+        columns = _found_or_written(data, layout, folder / key)
+    except OatGymError:
+        raise
+    except OSError as error:
+        raise SaveError(
+            f"The columns of {data.id!r} could not be kept in {folder} ({error}); nothing incomplete was left there. "
+            "Free some space, or name a folder that can be written in memory_map (None keeps them in memory)."
+        ) from error
+    if columns is None:
+        raise SaveError(f"The columns written to {folder / key} did not read back as they were: check the disk.")
+    return columns
+
+
+def _found_or_written(data: MinariDataset, layout: Layout, target: Path) -> Columns | None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(target.with_name(f".{target.name}.lock")):
         columns = _open(target, layout)
         if columns is None:
             _write(data, layout, target)
             columns = _open(target, layout)
-    if columns is None:
-        raise OSError(f"The columns written to {target} did not read back as they were written: check the disk.")
     return columns
 
 

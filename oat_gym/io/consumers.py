@@ -14,13 +14,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from gymnasium import spaces
-from minari import MinariDataset
 
 from oat_gym._rng import check_seed, derive, torch_generator
 from oat_gym.errors import ConfigurationError, InvalidDataError, UnsupportedSpaceError
-from oat_gym.io._columns import Columns, Layout, columns_in_memory
+from oat_gym.io._columns import Columns, DataSource, Layout, columns_in_memory, open_source
 from oat_gym.io._loader_config import check_count
-from oat_gym.recipe import find_dataset
 from oat_gym.spaces import Batch, FlatSpace, map_tree
 
 FLOAT32 = np.dtype(np.float32)
@@ -29,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 
 def to_torchrl(
-    data: MinariDataset | str,
+    data: DataSource,
     *,
     batch_size: int = 256,
     slice_length: int | None = None,
@@ -47,7 +45,8 @@ def to_torchrl(
     whose last step has neither flag is marked truncated there, since its next row is another episode's.
 
     Args:
-        data: a Minari dataset or a view of one, or the id of an installed or embedded one.
+        data: a Minari dataset or a view of one, the id of an installed or embedded one, or the path of a D4RL HDF5
+            file.
         batch_size: rows in a sample (`buffer.sample()`).
         slice_length: sample runs of this many steps of one episode (TorchRL's `SliceSampler`; shorter where the episode
             is) in place of single steps; it must divide `batch_size`.
@@ -80,7 +79,7 @@ def to_torchrl(
     return buffer
 
 
-def to_d3rlpy(data: MinariDataset | str) -> Any:
+def to_d3rlpy(data: DataSource) -> Any:
     """Return a `d3rlpy.dataset.MDPDataset` of a Minari dataset, augmented or not: an episode for each of ours.
 
     Use it in place of d3rlpy's `get_minari`, which in version 2.8 joins T+1 observations of an episode to T actions, so
@@ -99,8 +98,7 @@ def to_d3rlpy(data: MinariDataset | str) -> Any:
             and for literal seams (next states that are no observation have no place in the format).
         UnsupportedSpaceError: for actions that are neither Box nor Discrete, and for observations of no fixed size.
     """
-    if isinstance(data, str):
-        data = find_dataset(data)
+    data = open_source(data)
     dataset, constants = _optional("d3rlpy.dataset", "d3rlpy"), _optional("d3rlpy.constants", "d3rlpy")
     columns = _columns(data, flat=False)
     steps = {name: column[:-1].numpy() for name, column in columns.steps.items()}
@@ -129,11 +127,8 @@ def _optional(module: str, package: str) -> ModuleType:
         raise ImportError(f"{package} is needed for this and is not installed: pip install {package}") from error
 
 
-def _columns(data: MinariDataset | str, *, flat: bool) -> Columns:
-    if isinstance(data, str):
-        data = find_dataset(data)
-    if not isinstance(data, MinariDataset):
-        raise ConfigurationError(f"A Minari dataset or the id of one is needed, got {data!r}.")
+def _columns(data: DataSource, *, flat: bool) -> Columns:
+    data = open_source(data)
     layout = Layout(data.observation_space, data.action_space, flat, FLOAT32)
     layout.check()
     return columns_in_memory(data, layout)

@@ -166,7 +166,7 @@ def write_d4rl(data: MinariDataset, path: str | os.PathLike[str]) -> Path:
         InvalidDataError: for what the layout cannot hold: no episodes, NaN, a truncation before an episode's last
             step, dtypes that differ between episodes, infos of other lengths, or values outside their spaces.
         ConfigurationError: if the folder of `path` is not there.
-        OSError: if the disk refuses; nothing is left behind.
+        SaveError: if the disk refuses; nothing is left behind.
 
     Example: `write_d4rl(minari.load_dataset("D4RL/door/human-v2"), "door-human.hdf5")`.
     """

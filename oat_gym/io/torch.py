@@ -7,16 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from minari import MinariDataset
-
 from oat_gym._rng import check_seed
 from oat_gym.errors import ConfigurationError
 from oat_gym.io._batches import TorchBatch
-from oat_gym.io._columns import Layout, columns_in_memory
+from oat_gym.io._columns import DataSource, Layout, columns_in_memory, open_source
 from oat_gym.io._loader import TorchLoader
 from oat_gym.io._loader_config import Kind, LoaderConfig, Sampling
 from oat_gym.io._memory_map import columns_on_disk
-from oat_gym.recipe import find_dataset
 
 __all__ = ["Kind", "LoaderConfig", "Sampling", "TorchBatch", "TorchLoader", "to_torch"]
 
@@ -24,7 +21,7 @@ DTYPES = {torch.float16: np.dtype(np.float16), torch.float32: np.dtype(np.float3
 
 
 def to_torch(
-    data: MinariDataset | str,
+    data: DataSource,
     *,
     kind: Kind = "transitions",
     batch_size: int = 256,
@@ -44,7 +41,8 @@ def to_torch(
     """Return a loader of torch batches of a Minari dataset, augmented or not; it is fitted and read now.
 
     Args:
-        data: a Minari dataset or a view of one, or the id of an installed or embedded one. Infos are not loaded.
+        data: a Minari dataset or a view of one, the id of an installed or embedded one, or the path of a D4RL HDF5
+            file. Infos are not loaded.
         kind: "transitions"; "windows" of `length` consecutive steps of one episode (one starts at every `stride`-th
             step and one at the end of each episode; a shorter episode is one padded window); or whole "episodes",
             padded to the longest of their batch. See `TorchBatch` for fields, shapes and masks.
@@ -71,6 +69,8 @@ def to_torch(
         InvalidDataError: for a dataset or view without episodes; for weights that leave nothing to draw.
         ConfigurationError: for settings that cannot work together.
         UnsupportedSpaceError: for Text and other spaces that no tensor holds.
+        DatasetNotFoundError: for an id or a path that is not on this machine.
+        SaveError: if `memory_map` cannot be written, or its disk is full.
 
     >>> loader = to_torch("oat_gym/maze2d-umaze-v0", batch_size=64, seed=0)
     >>> batch = next(iter(loader))
@@ -83,10 +83,7 @@ def to_torch(
     target = _check_device(device, pin_memory=pin_memory, memory_mapped=memory_map is not None)
     if dtype is not None and dtype not in DTYPES:
         raise ConfigurationError(f"dtype must be torch.float16, float32, float64 or None, got {dtype!r}.")
-    if isinstance(data, str):
-        data = find_dataset(data)
-    if not isinstance(data, MinariDataset):
-        raise ConfigurationError(f"to_torch reads a Minari dataset or the id of one, got {data!r}.")
+    data = open_source(data)
     layout = Layout(data.observation_space, data.action_space, flat, None if dtype is None else DTYPES[dtype])
     layout.check()
     on_disk = memory_map is not None

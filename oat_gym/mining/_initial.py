@@ -17,6 +17,14 @@ _MAX_FEATURES = 60
 _MAX_MIXTURE_ROWS = 20_000
 
 
+def load_scikit_learn() -> None:
+    """Import what this module uses of scikit-learn; a limit on threads holds only for libraries loaded before it."""
+    import sklearn.cluster
+    import sklearn.decomposition
+    import sklearn.metrics
+    import sklearn.mixture  # noqa: F401
+
+
 def kmeans_labels(rows: Rows, *, n_clusters: int, seed: int) -> Ints:
     """Cluster blocks of up to 20 consecutive rows by their means and second moments: (n,) labels.
 

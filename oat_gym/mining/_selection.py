@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
+from oat_gym.errors import ConfigurationError
 from oat_gym.mining._em import score_table
+from oat_gym.mining._initial import load_scikit_learn
 from oat_gym.mining._windows import Rows, join_series, stack_windows
 from oat_gym.mining.ticc import TICC, Initialisation
 
@@ -57,6 +59,13 @@ def choose_clusters(
     def fit(count: int, seed: int, init: Initialisation, report: Progress) -> TICC:
         return _fit(series, count, settings, seed=seed, times=times, init=init, progress=report)
 
+    n_rows = sum(len(item) for item in map(np.asarray, series))
+    if max(candidates) > n_rows:
+        raise ConfigurationError(
+            f"The largest number of clusters to try, {max(candidates)}, is more than the {n_rows} rows of all series: "
+            "give smaller candidates, or n_clusters."
+        )
+    load_scikit_learn()
     if len(candidates) == 1:
         return fit(candidates[0], seeds[0], settings.init, report), {}
     rows = join_series(series)

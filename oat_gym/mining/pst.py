@@ -227,7 +227,12 @@ def mine(
     length = config.length
     if length == "auto":
         wanted = int(np.ceil(config.auto_share * len(labels) - 1e-9))
-        length = max(1, longest_length(labels, wanted, aligned=config.aligned))
+        length = longest_length(labels, wanted, aligned=config.aligned)
+        if length < 1:
+            raise InvalidDataError(
+                f'length="auto" looks for windows that {wanted} of the {len(labels)} series share (auto_share='
+                f"{config.auto_share:g}), and not even single rows do. Lower auto_share, use fewer clusters, or give a length."
+            )
     curve = support_curve(labels, aligned=config.aligned)
     table = count_tdss(labels, length, aligned=config.aligned)
     curve[length] = int(table.support.max())

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from oat_gym._rng import check_seed
 from oat_gym.errors import ConfigurationError, InvalidDataError
 from oat_gym.mining._em import Problem, State, run_em, score_table
-from oat_gym.mining._initial import kmeans_labels, mixture_labels
+from oat_gym.mining._initial import kmeans_labels, load_scikit_learn, mixture_labels
 from oat_gym.mining._viterbi import viterbi
 from oat_gym.mining._windows import Rows, join_series, stack_windows, standardisation, switch_penalties
 
@@ -145,9 +145,8 @@ class TICC:
             standardisation(raw.values) if self.standardize else (np.zeros(width), np.ones(width))
         )
         rows = self._standardised(raw)
-        with threadpool_limits(
-            limits=1
-        ):  # small matrices are faster on one thread, and the result does not depend on it
+        load_scikit_learn()
+        with threadpool_limits(limits=1):  # faster for small matrices, and the result does not depend on their number
             problem = self._problem(rows, times)
             runs = {
                 name: run_em(

@@ -13,8 +13,9 @@ from minari.data_collector import EpisodeBuffer
 import oat_gym
 from oat_gym import OAT, AugmentedDataset, MiningConfig
 from oat_gym.episodes import content_hash
-from oat_gym.errors import ConfigurationError, InvalidDataError, UnsupportedSpaceError
-from oat_gym.generation import VAEMDPConfig
+from oat_gym.errors import AugmentationWarning, ConfigurationError, InvalidDataError, UnsupportedSpaceError
+from oat_gym.generation import BehaviorConfig, VAEMDPConfig
+from oat_gym.mining import count_tdss
 from tests.conftest import install_dataset, walks
 
 
@@ -175,6 +176,8 @@ def test_episodes_without_an_occurrence_are_copied_and_say_so(tiny_oat: OAT) -> 
     )
     real = install_dataset("test/mixed-v0", [*walks(8, 24), short], box, spaces.Box(-1, 1, (2,)))
     data = AugmentedDataset(real, tiny_oat, factor=2)
+    with pytest.warns(AugmentationWarning, match=r"1 of 9 episodes hold no window .* exact copies"):
+        data.fit()
     assert data.provenance(17).spans == ()
     assert content_hash([data[17]]) == content_hash([data[8]])
     assert "1 of 9 series" in repr(data.mining)
@@ -251,6 +254,79 @@ def test_global_random_states_are_not_touched(walk_dataset: minari.MinariDataset
     assert torch.equal(torch.get_rng_state(), torch_state)
 
 
+class _Still:
+    """A policy that never moves."""
+
+    def sample(self, observations: np.ndarray, *, rng: np.random.Generator) -> np.ndarray:
+        assert observations.dtype == np.float32
+        return np.zeros((len(observations), 2), dtype=np.float32)
+
+    def log_prob(self, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return np.zeros(len(observations))
+
+
+def test_a_policy_of_the_users_acts_in_the_roll_outs(walk_dataset: minari.MinariDataset, tiny_oat: OAT) -> None:
+    config = dataclasses.replace(tiny_oat, policy=_Still())
+    data = AugmentedDataset(walk_dataset, config, factor=2)
+    for number in range(12, 24):
+        mask = data.provenance(number).mask
+        assert (data[number].actions[mask] == 0).all()
+    with pytest.raises(ConfigurationError, match="lazy=False"):
+        data.save("test/policy-v0", lazy=True)
+    with pytest.raises(ConfigurationError, match="policy"):
+        OAT(policy=3)
+
+
+def test_integer_rewards_become_floats_in_synthetic_episodes_only(tiny_oat: OAT) -> None:
+    buffers = [dataclasses.replace(b, rewards=np.arange(len(b.rewards)) % 3) for b in walks(8, 24)]
+    real = install_dataset("test/integers-v0", buffers, spaces.Box(-100, 100, (2,)), spaces.Box(-1, 1, (2,)))
+    data = AugmentedDataset(real, tiny_oat, factor=2)
+    assert data[0].rewards.dtype.kind == "i"
+    episode, mask = data[8], data.provenance(8).mask
+    assert episode.rewards.dtype == np.float64
+    assert (episode.rewards[mask] != np.rint(episode.rewards[mask])).any()
+    np.testing.assert_array_equal(episode.rewards[~mask], data[0].rewards[~mask])
+
+
+def test_samples_are_numbered_once(walk_dataset: minari.MinariDataset, tiny_oat: OAT) -> None:
+    data = AugmentedDataset(walk_dataset, tiny_oat, factor=5)
+    found = [(span.pst_set, span.sample) for i in range(12, 60) for span in data.provenance(i).spans]
+    assert len(found) == len(set(found)) > 48
+
+
+def test_constant_features_and_episodes_of_one_step_are_modelled() -> None:
+    buffers = [
+        EpisodeBuffer(
+            observations=np.array([[1.0, 7.0], [e, 7.0]], dtype=np.float32),
+            actions=np.full((1, 1), e, dtype=np.float32),
+            rewards=np.array([float(e)]),
+            terminations=[True],
+            truncations=[False],
+        )
+        for e in range(12)
+    ]
+    wide = spaces.Box(-100, 100, (2,)), spaces.Box(-100, 100, (1,))
+    real = install_dataset("test/bandit-v0", buffers, *wide)
+    config = OAT(
+        mining=MiningConfig(n_clusters=2, length=1),
+        model=VAEMDPConfig(max_updates=5),
+        behavior=BehaviorConfig(max_updates=5),
+    )
+    for episode in AugmentedDataset(real, config, factor=2):
+        np.testing.assert_array_equal(episode.observations[:, 1], 7)
+        assert len(episode) == 1
+
+
+@pytest.mark.shared_data
+@pytest.mark.usefixtures("shared_data")
+def test_ten_clusters_and_full_support_on_the_door_demonstrations() -> None:
+    """The paper's own values for door-human (appendix B.2), with the default settings on the converted dataset."""
+    mining = OAT().mine(oat_gym.domains.load("adroit-door-human"))
+    assert mining.n_clusters == 10
+    assert mining.sets[0].support == 25
+    assert all(count_tdss(list(mining.labels), width).support.max() == 25 for width in (10, 20, 30, 40))
+
+
 @pytest.mark.shared_data
 @pytest.mark.usefixtures("shared_data")
 def test_a_log_of_short_episodes_gets_a_clear_answer() -> None:
@@ -261,3 +337,8 @@ def test_a_log_of_short_episodes_gets_a_clear_answer() -> None:
     mining = OAT(mining=MiningConfig(n_clusters=4, length=20)).mine(tutoring)
     assert mining.n_too_short > 150
     assert f"{mining.n_too_short} of 178 series" in repr(mining)
+    config = OAT(
+        mining=MiningConfig(n_clusters=4), model=VAEMDPConfig(max_updates=5), behavior=BehaviorConfig(max_updates=5)
+    )
+    with pytest.warns(AugmentationWarning, match=r"1\d\d of 178 episodes hold no window .* exact copies"):
+        AugmentedDataset(tutoring, config, factor=2).fit()

@@ -66,7 +66,7 @@ def test_samples_find_their_episode() -> None:
         "seams": np.array([[0.1, 0.2], [0.3, 0.4]]),
     }
     samples = SpanSamples.decode(arrays, observations, FlatSpace.of(spaces.Box(-1, 1, (1,))))
-    span, new = samples.replacement(9, pst_set=2, k=3)
+    span, new = samples.replacement(9, pst_set=2, number=7)
     assert (span.start, span.stop, span.pst_set, span.sample, span.seam) == (1, 3, 2, 7, (0.3, 0.4))
     assert new.observations["x"][:, 0].tolist() == [20, 20, 20]
     assert new.rewards.tolist() == [3, 4]

@@ -165,17 +165,6 @@ def test_door_demonstrations(shared_data):
         assert count_tdss(list(result.labels), 40).support.max() == 25
 
 
-@pytest.mark.shared_data
-def test_ten_clusters_by_silhouette_on_the_door_demonstrations(shared_data):
-    """The paper's own value for door-human (appendix B.2)."""
-    data = np.load(shared_data / "robotics" / "adroit_human" / "door_human_25demos.npz")
-    series = np.split(data["observations"], np.cumsum(data["lengths"])[:-1])
-    config = MiningConfig(n_clusters="auto", candidates=tuple(range(10, 21, 2)), init="kmeans")
-    result = mine(series, config=config, rng=np.random.default_rng(0))
-    assert result.n_clusters == 10
-    assert result.sets[0].support == 25
-
-
 def test_distinct_sets_are_not_one_set_moved_by_a_row():
     sequence = np.repeat([0, 1, 2, 3], 10)
     labels = [sequence.copy() for _ in range(5)]
