@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import platform
 import shutil
@@ -20,9 +21,9 @@ def owned_folder(prefix: str, parent: Path) -> Path:
 
 def remove_abandoned(prefix: str, parent: Path) -> None:
     """Remove the folders that `owned_folder` made in processes of this machine that no longer run."""
-    for folder in parent.glob(f"{prefix}{platform.node()}-*"):
-        owner = folder.name.split("-")[-2]
-        if owner.isdecimal() and not is_running(int(owner)):
+    for folder in parent.glob(f"{glob.escape(prefix)}*-*-*"):
+        host, owner, _ = folder.name.removeprefix(prefix).rsplit("-", 2)
+        if host == platform.node() and owner.isdecimal() and not is_running(int(owner)):
             shutil.rmtree(folder, ignore_errors=True)
 
 

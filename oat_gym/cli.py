@@ -32,6 +32,8 @@ from oat_gym.report import DatasetSummary, GroupSummary, real_episodes, summariz
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False)
 cache_app = typer.Typer(no_args_is_help=True, help="What the cache holds, and emptying it.")
 app.add_typer(cache_app, name="cache")
+_WRONG_USAGE: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "UsageError")
+"""What wrong arguments raise; typer has no public name for it."""
 out = Console(highlight=False, soft_wrap=True)
 
 DEMO_ID = "maze2d-umaze/oat-v0"
@@ -62,8 +64,8 @@ def main() -> None:
     except (OatGymError, OSError) as error:
         _complain(str(error))
         sys.exit(2)
-    except typer.BadParameter.__base__ as error:  # the base of all wrong arguments; typer gives it no public name
-        _complain(error.format_message())
+    except _WRONG_USAGE as error:
+        _complain(getattr(error, "format_message", error.__str__)())
         sys.exit(2)
     except KeyboardInterrupt:
         print("oat-gym: interrupted; what was finished is kept.", file=sys.stderr)

@@ -19,7 +19,14 @@ from oat_gym.augmenters.oat import OAT
 from oat_gym.cache import canonical
 from oat_gym.episodes import Transitions, collect_transitions
 from oat_gym.errors import ConfigurationError, InvalidDataError
-from oat_gym.export import DATA_FORMATS, DataFormat, check_dataset_id, new_dataset_folder, write_dataset
+from oat_gym.export import (
+    DATA_FORMATS,
+    DataFormat,
+    check_dataset_id,
+    check_length,
+    new_dataset_folder,
+    write_dataset,
+)
 from oat_gym.io.d4rl import is_d4rl_path, read_d4rl
 from oat_gym.mining import MiningResult
 from oat_gym.progress import ProgressCallback
@@ -190,6 +197,10 @@ class AugmentedDataset(MinariDataset):
     ) -> MinariDataset:
         """Store this dataset (or this view) under `dataset_id` among Minari's local datasets and return it opened.
 
+        HDF5 stores exactly what is iterated. Arrow and Parquet hold infos of T+1 rows only: infos of T rows get a copy
+        of their first row before them there, and the episode's metadata has `infos_rows` = T; integer rewards become
+        floats.
+
         Args:
             dataset_id: (namespace/)name-v(version), free.
             data_format: Minari's storage format: "hdf5", "arrow" or "parquet".
@@ -199,6 +210,7 @@ class AugmentedDataset(MinariDataset):
 
         Raises:
             DatasetExistsError: if there is a dataset of this id; before any work.
+            InvalidDataError: for an episode of over 32,766 steps in Arrow or Parquet, which would cut it.
             ConfigurationError: for a malformed id or format, or for a recipe that could not be followed elsewhere.
         """
         check_dataset_id(dataset_id)
@@ -206,6 +218,8 @@ class AugmentedDataset(MinariDataset):
             raise ConfigurationError(f"data_format must be one of {', '.join(DATA_FORMATS)}, got {data_format!r}.")
         if lazy:
             return self._save_recipe(dataset_id, mark_steps=mark_steps)
+        for number, length in enumerate(self.storage.lengths(self.episode_indices)):
+            check_length(number, int(length), data_format)
         like = source_metadata(self) | {"oat_gym": self.description()}
         with new_dataset_folder(dataset_id) as data_path:
             write_dataset(

@@ -67,7 +67,7 @@ def check_episode(episode: EpisodeData, observation_space: spaces.Space[Any], ac
     parts = [("observations", episode.observations, observation_space, length + 1)]
     parts.append(("actions", episode.actions, action_space, length))
     for name, batch, space, expected in parts:
-        for path, _ in iter_leaf_spaces(space):
+        for path, leaf_space in iter_leaf_spaces(space):
             leaf = batch
             for key in path:
                 leaf = leaf[key]
@@ -76,6 +76,12 @@ def check_episode(episode: EpisodeData, observation_space: spaces.Space[Any], ac
                 raise InvalidDataError(
                     f"Episode {episode.id} has {length} rewards but {len(leaf)} {name}{where}, expected {expected}: "
                     "an episode of T steps holds T+1 observations and T actions."
+                )
+            if isinstance(leaf, np.ndarray) and leaf_space.shape is not None and leaf.shape[1:] != leaf_space.shape:
+                where = "".join(f"[{key!r}]" for key in path)
+                raise InvalidDataError(
+                    f"Episode {episode.id} has {name}{where} of shape {leaf.shape[1:]} a step; {leaf_space} has "
+                    f"{leaf_space.shape}."
                 )
     for name in ("terminations", "truncations"):
         got = len(getattr(episode, name))

@@ -137,7 +137,7 @@ def write_dataset(
 
     Minari's Arrow and Parquet storage takes infos of T+1 rows only (a row of the reset, then those of the steps).
     Infos of T rows get a copy of their first row before them there, and the episode's metadata says so:
-    `infos_rows` is then T, the number of the last rows that were recorded.
+    `infos_rows` is then T, the number of the last rows that were recorded. Integer rewards become floats there.
 
     Args:
         data_path: the dataset's `data` folder.
@@ -182,7 +182,7 @@ def write_dataset(
     storage.update_metadata({"dataset_size": float(storage.get_size())})
 
 
-def check_length(number: int, length: int, data_format: DataFormat) -> None:
+def check_length(number: int, length: int, data_format: str) -> None:
     """Check that an episode of `length` steps can be read back from a data format.
 
     Raises:
@@ -256,11 +256,15 @@ def _buffer(number: int, episode: EpisodeData, mask: Any, *, for_arrow: bool) ->
         infos = {**(infos or {}), "synthetic": np.concatenate([np.zeros(rows - len(mask), dtype=bool), mask])}
     if infos and for_arrow:
         infos = map_tree(lambda leaf: _arrow_info(leaf, len(episode.rewards)), infos)
+    # Arrow reads all episodes as one table, and generated rewards are floats where recorded ones may be integers.
+    rewards = (
+        episode.rewards.astype(np.float64) if for_arrow and episode.rewards.dtype.kind in "biu" else episode.rewards
+    )
     return EpisodeBuffer(
         id=number,
         observations=episode.observations,
         actions=episode.actions,
-        rewards=episode.rewards,  # pyright: ignore[reportArgumentType]  (Minari takes arrays as well as lists)
+        rewards=rewards,  # pyright: ignore[reportArgumentType]  (Minari takes arrays as well as lists)
         terminations=episode.terminations,  # pyright: ignore[reportArgumentType]
         truncations=episode.truncations,  # pyright: ignore[reportArgumentType]
         infos=infos,

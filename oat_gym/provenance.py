@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from oat_gym.episodes import BoolArray
+from oat_gym.lazy_metadata import LazyMetadata
 from oat_gym.stitching import Span, spans_mask
 
 METADATA_KEYS = ("synthetic", "source", "variation", "spans", "pst_sets", "samples", "seams")
@@ -75,7 +76,7 @@ class Provenance:
 
 def has_provenance(metadata: Mapping[str, Any]) -> bool:
     """Whether episode metadata holds a provenance: all our keys, since users have keys called "source" too."""
-    return all(key in metadata for key in METADATA_KEYS)
+    return isinstance(metadata, LazyMetadata) or all(key in metadata for key in METADATA_KEYS)
 
 
 def merge_spans(old: tuple[Span, ...], new: tuple[Span, ...]) -> tuple[Span, ...]:

@@ -24,7 +24,8 @@ from minari.storage import get_dataset_path
 from oat_gym.augmenters import AUGMENTERS
 from oat_gym.cache import FORMAT_VERSION, canonical
 from oat_gym.embedded import EMBEDDED, embedded_path
-from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError, OatGymError
+from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError, OatGymError, SourceChangedError
+from oat_gym.provenance import METADATA_KEYS
 from oat_gym.serialization import config_from_json, read_json
 from oat_gym.source import Source
 from oat_gym.synthesis import Synthesis
@@ -130,6 +131,7 @@ def write_recipe(synthesis: Synthesis) -> bytes:
             "id": dataset.id,
             "episodes": None if everything else synthesis.source.ids.tolist(),
             "content": synthesis.source.fingerprint,
+            "metadata": synthesis.source.metadata_fingerprint,
         },
         "augmenter": {"name": augmenter.name, "settings": settings},
         "count": synthesis.count,
@@ -174,8 +176,9 @@ def _plan_of(recipe: dict[str, Any], path: pathlib.Path) -> Synthesis:
     name, origin = recipe["augmenter"]["name"], recipe["source"]
     if not isinstance(name, str) or name not in AUGMENTERS:
         raise InvalidDataError(f"{path} names the augmenter {name!r}; known are {', '.join(AUGMENTERS)}.")
-    if not isinstance(origin["content"], str) or not _SHA256.fullmatch(origin["content"]):
-        raise InvalidDataError(f"{path} gives {origin['content']!r} for the SHA-256 of its source's content.")
+    for key in ("content", "metadata"):
+        if not isinstance(origin[key], str) or not _SHA256.fullmatch(origin[key]):
+            raise InvalidDataError(f"{path} gives {origin[key]!r} for the SHA-256 of its source's {key}.")
     augmenter = config_from_json(AUGMENTERS[name], recipe["augmenter"]["settings"])
     _check_chain(path)
     dataset, episodes = find_dataset(origin["id"]), origin["episodes"]
@@ -185,6 +188,11 @@ def _plan_of(recipe: dict[str, Any], path: pathlib.Path) -> Synthesis:
             raise InvalidDataError(f"{path} names episodes that {dataset.id!r} does not have.")
         dataset = MinariDataset(dataset.storage, episode_indices=np.array(episodes, dtype=np.int64))
     source = Source(dataset, expected_fingerprint=origin["content"])
+    if source.metadata_fingerprint != origin["metadata"]:
+        raise SourceChangedError(
+            f"The episode metadata (seeds, options, lengths) of {dataset.id!r} is no longer what the recipe at "
+            f"{path} was made from. Restore that version, or augment the new one."
+        )
     return Synthesis(source, augmenter, count=recipe["count"], seed=recipe["seed"])
 
 
@@ -232,7 +240,7 @@ def check_folder(data_path: pathlib.Path) -> None:
     appended = data_path / APPENDED
     episodes = steps = 0
     if (appended / METADATA_FILE_NAME).exists():
-        episodes, steps = _check_appended(appended)
+        episodes, steps = _check_appended(appended, metadata)
     if not (data_path / RECIPE_FILE).exists() and (metadata["total_episodes"], metadata["total_steps"]) != (
         episodes,
         steps,
@@ -261,9 +269,12 @@ def _check_metadata(data_path: pathlib.Path) -> dict[str, Any]:
     return metadata
 
 
-def _check_appended(appended: pathlib.Path) -> tuple[int, int]:
-    """Return the episodes and steps of the appended part, counted."""
+def _check_appended(appended: pathlib.Path, whole: dict[str, Any]) -> tuple[int, int]:
+    """Return the episodes and steps of the appended part, counted; `whole` is the metadata of the dataset."""
     claimed = _check_metadata(appended)
+    for key in ("observation_space", "action_space"):
+        if deserialize_space(claimed[key]) != deserialize_space(whole[key]):
+            raise InvalidDataError(f"{appended} has another {key} than the dataset it was added to.")
     if claimed["data_format"] not in ("hdf5", "arrow", "parquet"):
         raise InvalidDataError(f"{appended} has the format {claimed['data_format']!r}, which no appended part has.")
     total = claimed["total_episodes"]
@@ -282,7 +293,7 @@ def _check_edits(path: pathlib.Path, total: int) -> None:
     numbers = {str(number) for number in range(min(total, len(edits)))} if isinstance(edits, dict) else set[str]()
     for key, value in edits.items() if isinstance(edits, dict) else [("it", edits)]:
         known = key in numbers or (key.isascii() and key.isdecimal() and int(key) < total)
-        if not known or not isinstance(value, dict):
+        if not known or not isinstance(value, dict) or {"id", "total_steps", *METADATA_KEYS} & value.keys():
             raise InvalidDataError(f"{path} is damaged: {key!r} names no episode of {total}, or no metadata of one.")
 
 

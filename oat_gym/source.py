@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import hashlib
+import json
 import warnings
 from functools import cached_property
 from typing import Any
@@ -14,7 +16,9 @@ from minari import EpisodeData, MinariDataset
 
 from oat_gym.episodes import IntArray, check_episode, content_hash
 from oat_gym.errors import InvalidDataError, SourceChangedError
+from oat_gym.lazy_metadata import LazyMetadata
 from oat_gym.provenance import METADATA_KEYS, has_provenance
+from oat_gym.serialization import metadata_to_json
 from oat_gym.spaces import FlatSpace
 
 
@@ -123,6 +127,19 @@ class Source:
     def fingerprint(self) -> str:
         """SHA-256 of the episodes' content, the same whatever the storage format."""
         return content_hash(self.episodes)
+
+    @cached_property
+    def metadata_fingerprint(self) -> str:
+        """SHA-256 of what the storage keeps for each episode beside its data, without numbers and provenance."""
+        rows = [
+            {
+                key: metadata_to_json(value)
+                for key, value in (part.known_items() if isinstance(part, LazyMetadata) else part.items())
+                if key not in ("id", *METADATA_KEYS)
+            }
+            for part in self.metadata
+        ]
+        return hashlib.sha256(json.dumps(rows, sort_keys=True).encode()).hexdigest()
 
     @cached_property
     def flat_observations(self) -> FlatSpace:

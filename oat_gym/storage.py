@@ -23,6 +23,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+from minari import EpisodeData
 from minari.data_collector import EpisodeBuffer
 from minari.dataset._storages import _registry  # pyright: ignore[reportPrivateUsage]
 from minari.dataset.minari_dataset import MinariDatasetSpec
@@ -31,10 +32,20 @@ from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
 from oat_gym._staging import owned_folder
 from oat_gym.augmenters.base import Variation
 from oat_gym.cache import write_atomically
-from oat_gym.episodes import copy_episode
-from oat_gym.errors import InvalidDataError, SourceChangedError
-from oat_gym.provenance import Provenance, merge_spans
-from oat_gym.recipe import APPENDED, DATA_FORMAT, EPISODE_METADATA_FILE, LIVE_RECIPE, RECIPE_FILE, open_recipe
+from oat_gym.episodes import check_episode, copy_episode
+from oat_gym.errors import InvalidDataError, SaveError, SourceChangedError
+from oat_gym.export import buffer_bytes, check_length, ensure_space, is_disk_error
+from oat_gym.lazy_metadata import LazyMetadata
+from oat_gym.provenance import METADATA_KEYS, Provenance, merge_spans
+from oat_gym.recipe import (
+    APPENDED,
+    DATA_FORMAT,
+    EPISODE_METADATA_FILE,
+    LIVE_RECIPE,
+    RECIPE_FILE,
+    check_if_augmented,
+    open_recipe,
+)
 from oat_gym.serialization import metadata_to_json, source_metadata
 from oat_gym.source import Source
 from oat_gym.synthesis import Synthesis
@@ -94,9 +105,31 @@ class AugmentedStorage(MinariStorage):
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle as the directory where that describes the dataset, else as the plan; never as open data."""
         if self.synthesis is None or str(self.data_path) not in _live:
-            return MinariStorage.read, (str(self.data_path),)
+            return _read, (str(self.data_path),)
         plan = self.synthesis
-        return _reopen, (str(self.data_path), plan.source.view, plan.augmenter, plan.count, plan.seed)
+        overlay = _Overlay(self._appended_buffers(), self.edited_metadata())
+        return _reopen, (str(self.data_path), overlay, plan.source.view, plan.augmenter, plan.count, plan.seed)
+
+    def _appended_buffers(self) -> list[EpisodeBuffer]:
+        if not (self.data_path / APPENDED).exists():
+            return []
+        storage = self._appended_storage()
+        numbers = range(storage.total_episodes)
+        parts = zip(storage.get_episodes(numbers), storage.get_episode_metadata(numbers), strict=True)
+        return [
+            dataclasses.replace(
+                EpisodeBuffer(seed=metadata.get("seed"), options=metadata.get("options")), **{**data, "id": None}
+            )
+            for data, metadata in parts
+        ]
+
+    @property
+    def total_episodes(self) -> int:
+        """Number of real, synthetic and appended episodes."""
+        if self.synthesis is None:
+            return super().total_episodes
+        has_appended = (self.data_path / APPENDED).exists()
+        return self.n_planned + (self._appended_storage().total_episodes if has_appended else 0)
 
     @property
     def n_real(self) -> int:
@@ -122,17 +155,26 @@ class AugmentedStorage(MinariStorage):
 
     def get_episodes(self, episode_indices: Iterable[int]) -> Iterator[dict[str, Any]]:
         """Yield the data of the episodes, in the order asked for; synthetic ones are made now."""
-        total = self.total_episodes
-        for kind, run in itertools.groupby(episode_indices, key=lambda number: self._kind(number, total)):
+        for kind, numbers in self._runs(episode_indices):
             if kind == "synthetic":
                 synthesis = self._plan()
-                for number in run:
+                for number in numbers:
                     variation = synthesis.variation(int(number) - self.n_real)
                     yield {**vars(variation.episode), "id": number}
             elif kind == "real":
-                yield from self._real_episodes(list(run))
+                yield from self._real_episodes(numbers)
             else:
-                yield from self._appended_episodes(list(run))
+                yield from self._appended_episodes(numbers)
+
+    def _runs(self, episode_indices: Iterable[int]) -> Iterator[tuple[str, list[int]]]:
+        """Yield runs of ids of one kind; one id at a time where the ids are an iterator, which may have no end."""
+        if isinstance(episode_indices, Iterator):
+            for number in episode_indices:
+                yield self._kind(number, self.total_episodes), [number]
+            return
+        total = self.total_episodes
+        for kind, run in itertools.groupby(episode_indices, key=lambda number: self._kind(number, total)):
+            yield kind, list(run)
 
     def variation(self, number: int) -> Variation | None:
         """Return how the synthetic episode with id `number` was made; None for a real or an appended one."""
@@ -161,10 +203,17 @@ class AugmentedStorage(MinariStorage):
                 metadata = dict(next(iter(self._appended_storage().get_episode_metadata([local]))))
             else:
                 source = number if number < self.n_real else (number - self.n_real) % self.n_real
-                metadata = copy.deepcopy(self._plan().source.metadata[source])  # options nest, and users may edit them
-                metadata |= self.provenance(number).to_metadata()
-                metadata["total_steps"] = int(self._plan().lengths[number])
-            yield metadata | {"id": number} | edits.get(str(number), {})
+                metadata = self._planned_metadata(number, source)
+            metadata.update({"id": number, **edits.get(str(number), {})})
+            yield metadata
+
+    def _planned_metadata(self, number: int, source: int) -> dict[str, Any]:
+        """Return the source's metadata and ours, which of a synthetic episode is made when it is asked for."""
+        inherited = self._plan().source.metadata[source]
+        known = inherited.known_items() if isinstance(inherited, LazyMetadata) else inherited.items()
+        metadata = copy.deepcopy({key: value for key, value in known if key not in METADATA_KEYS})
+        metadata["total_steps"] = int(self._plan().lengths[number])
+        return LazyMetadata(metadata, lambda: self.provenance(number).to_metadata())
 
     def update_episode_metadata(
         self, metadatas: Iterable[dict[str, Any]], episode_indices: Iterable[int] | None = None
@@ -178,6 +227,9 @@ class AugmentedStorage(MinariStorage):
         total = self.total_episodes
         for number, update in zip(map(int, indices), updates, strict=True):
             self._kind(number, total)
+            reserved = sorted({"id", "total_steps", *METADATA_KEYS} & update.keys())
+            if reserved:
+                raise InvalidDataError(f"The metadata {', '.join(reserved)} of an episode cannot be changed.")
             edits[str(number)] = edits.get(str(number), {}) | metadata_to_json(update)
         write_atomically(self.data_path / EPISODE_METADATA_FILE, json.dumps(edits).encode())
         self.update_metadata({"dataset_size": self.get_size()})
@@ -196,13 +248,23 @@ class AugmentedStorage(MinariStorage):
                     f"Episode id {buffer.id} cannot be written: ids 0 to {self.n_planned - 1} are the source's and the "
                     f"synthetic ones, and the next free id is {self.n_planned + storage.total_episodes}."
                 )
-            storage.update_episodes([dataclasses.replace(buffer, id=local)])
+            self._append(storage, dataclasses.replace(buffer, id=local))
         planned = int(self.synthesis.lengths.sum()) if self.synthesis else 0
         totals = {
             "total_episodes": self.n_planned + storage.total_episodes,
             "total_steps": planned + storage.total_steps,
         }
         self.update_metadata({**totals, "dataset_size": self.get_size()})
+
+    def _append(self, storage: MinariStorage, buffer: EpisodeBuffer) -> None:
+        check_length(0 if buffer.id is None else buffer.id, len(buffer.rewards), storage.FORMAT)
+        try:
+            ensure_space(self.data_path, buffer_bytes(buffer))  # HDF5 takes the interpreter down on a full disk
+            storage.update_episodes([buffer])
+        except (OSError, RuntimeError, ValueError) as error:
+            if not is_disk_error(error):
+                raise
+            raise SaveError(f"An episode could not be added at {self.data_path} ({error}): free some space.") from error
 
     def update_metadata(self, metadata: dict[str, Any]) -> None:
         """Add or change metadata of the dataset, as Minari does, but atomically: a crash leaves the old file whole."""
@@ -237,7 +299,8 @@ class AugmentedStorage(MinariStorage):
     def _check_totals(self, synthesis: Synthesis) -> None:
         appended = self._appended_storage() if (self.data_path / APPENDED).exists() else None
         episodes = self.n_planned + (appended.total_episodes if appended else 0)
-        claimed = (self.total_episodes, self.total_steps)
+        metadata = MinariStorage.read_raw_metadata(self.data_path)
+        claimed = (metadata["total_episodes"], metadata["total_steps"])
         if self.n_planned <= claimed[0] <= episodes:
             steps = int(synthesis.lengths.sum()) + (appended.total_steps if appended else 0)
             if claimed == (episodes, steps):
@@ -264,11 +327,13 @@ class AugmentedStorage(MinariStorage):
         stored = source.dataset.storage.get_episodes(list(source.ids[numbers]))
         for number, data in zip(numbers, stored, strict=True):
             source.check_length(int(number), len(data["rewards"]))
+            check_episode(EpisodeData(**data), self.observation_space, self.action_space)
             yield {**data, "id": number}
 
     def _appended_episodes(self, numbers: list[int]) -> Iterator[dict[str, Any]]:
         stored = self._appended_storage().get_episodes([number - self.n_planned for number in numbers])
         for number, data in zip(numbers, stored, strict=True):
+            check_episode(EpisodeData(**data), self.observation_space, self.action_space)
             yield {**data, "id": number}
 
     def _appended_storage(self) -> MinariStorage:
@@ -329,12 +394,30 @@ def _remove(path: str, pid: int) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def _reopen(path: str, *plan: Any) -> MinariStorage:
+@dataclasses.dataclass(frozen=True)
+class _Overlay:
+    """What was added to a live dataset: appended episodes, and edits of metadata."""
+
+    appended: list[EpisodeBuffer]
+    edits: dict[str, dict[str, Any]]
+
+
+def _read(path: str) -> MinariStorage:
+    check_if_augmented(pathlib.Path(path))
+    return MinariStorage.read(path)
+
+
+def _reopen(path: str, overlay: _Overlay, *plan: Any) -> MinariStorage:
     if path in _live:
         return MinariStorage.read(path)
     dataset, augmenter, count, seed = plan
     synthesis = Synthesis(Source(dataset), augmenter, count=count, seed=seed)
     if not pathlib.Path(path).exists():
-        return AugmentedStorage.of(synthesis)
+        storage = AugmentedStorage.of(synthesis)
+        if overlay.appended:
+            storage.update_episodes(overlay.appended)
+        if overlay.edits:
+            storage.update_episode_metadata(overlay.edits.values(), map(int, overlay.edits))
+        return storage
     _attach(pathlib.Path(path), synthesis, owned=False)
     return MinariStorage.read(path)

@@ -38,7 +38,7 @@ def test_help(command: list[str]) -> None:
         (["augment", "maze2d-umaze", "--format", "csv"], "--format"),
         (["augment", "maze2d-umaze", "--out", "no id"], "is no dataset id"),
         (["augment", "maze2d-umaze", "--top", "0"], "top must be"),
-        (["augment", "maze2d-umaze", "--factor", "ten"], "'ten' is not a valid float"),
+        (["augment", "maze2d-umaze", "--factor", "ten"], "Invalid value for '--factor'"),
         (["augment", "maze2d-umaze", "--length", "\u00b2"], "--length"),
         (["augment"], "Missing argument"),
         (["magic"], "No such command"),

@@ -1,7 +1,10 @@
 """AugmentedDataset as a Minari dataset, with an augmenter that needs no training."""
 
 import copy
+import itertools
+import json
 import pickle
+import platform
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,7 +19,8 @@ from minari.dataset import _storages
 
 import oat_gym
 from oat_gym import AugmentedDataset, Function
-from oat_gym.errors import ConfigurationError, InvalidDataError
+from oat_gym._staging import owned_folder
+from oat_gym.errors import ConfigurationError, InvalidDataError, SourceChangedError
 from oat_gym.storage import AugmentedStorage
 
 MakeDataset = Callable[..., minari.MinariDataset]
@@ -342,3 +346,79 @@ def test_a_function_that_returns_nonsense_is_told(
 
 def _cut(episode: EpisodeData) -> EpisodeData:
     return EpisodeData(**(vars(episode) | {"actions": episode.actions[:-1]}))
+
+
+def test_iterators_without_an_end_are_read_one_by_one(make_dataset: MakeDataset) -> None:
+    data = AugmentedDataset(make_dataset(LENGTHS), Function(shuffled_rewards), factor=2)
+    endless = data.iterate_episodes(number % 8 for number in itertools.count())
+    assert [int(next(endless).id) for _ in range(10)] == [0, 1, 2, 3, 4, 5, 6, 7, 0, 1]
+
+
+def never(episode: EpisodeData, rng: np.random.Generator) -> EpisodeData:
+    raise AssertionError("nothing may be generated")
+
+
+def test_counting_steps_generates_nothing_in_splits_and_nested_datasets(make_dataset: MakeDataset) -> None:
+    data = AugmentedDataset(make_dataset(LENGTHS), Function(never), factor=3)
+    assert sum(part.total_steps for part in minari.split_dataset(data, [5, 7], seed=0)) == 48
+    twice = AugmentedDataset(data, Function(never), factor=2)
+    assert (len(twice), twice.total_steps) == (24, 96)
+    metadata = next(iter(data.storage.get_episode_metadata([5])))
+    assert (metadata["total_steps"], metadata["seed"]) == (7, 1)
+    with pytest.raises(AssertionError, match="nothing may be generated"):
+        metadata["spans"]
+
+
+def test_a_pickle_outlives_the_process_with_all_that_was_added(make_dataset: MakeDataset) -> None:
+    data = AugmentedDataset(make_dataset(LENGTHS), Function(shuffled_rewards), factor=2, seed=1)
+    data.update_dataset_from_buffer([_buffer(2)])
+    data.storage.update_episode_metadata([{"note": "kept"}], [6])
+    pickled, episodes = pickle.dumps(data), list(data)
+    del data
+    twin = pickle.loads(pickled)
+    assert all(same(a, b) for a, b in zip(twin, episodes, strict=True))
+    assert next(iter(twin.storage.get_episode_metadata([6])))["note"] == "kept"
+
+
+def test_a_part_of_a_recipe_is_unpickled_by_a_process_that_knows_nothing(
+    walk_dataset: minari.MinariDataset, tiny_oat: oat_gym.OAT, tmp_path: Path
+) -> None:
+    AugmentedDataset(walk_dataset, tiny_oat, factor=2).save("test/lazy-v0", lazy=True)
+    part = minari.split_dataset(minari.load_dataset("test/lazy-v0"), [20], seed=0)[0]
+    (tmp_path / "part").write_bytes(pickle.dumps(part))
+    script = f"import pickle, pathlib\nprint(len(pickle.loads(pathlib.Path({str(tmp_path / 'part')!r}).read_bytes())))"
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert run.stdout.strip() == "20", run.stderr
+
+
+def test_data_of_another_shape_than_its_space_is_an_error(make_dataset: MakeDataset) -> None:
+    real = make_dataset(LENGTHS)
+    path = real.storage.data_path / "metadata.json"
+    metadata = json.loads(path.read_text())
+    metadata["action_space"] = metadata["action_space"].replace('"shape": [1]', '"shape": [7]')
+    for key in ("low", "high"):
+        space = json.loads(metadata["action_space"])
+        space[key] = [space[key][0]] * 7
+        metadata["action_space"] = json.dumps(space)
+    path.write_text(json.dumps(metadata))
+    data = AugmentedDataset(minari.load_dataset("test/coded-v0"), Function(shuffled_rewards), count=0)
+    with pytest.raises(InvalidDataError, match=r"actions of shape \(1,\) a step"):
+        data[0]
+
+
+def test_changed_seeds_of_a_source_are_a_changed_source(
+    walk_dataset: minari.MinariDataset, tiny_oat: oat_gym.OAT
+) -> None:
+    AugmentedDataset(walk_dataset, tiny_oat, factor=2).save("test/lazy-v0", lazy=True)
+    walk_dataset.storage.update_episode_metadata([{"seed": 999}], [0])
+    with pytest.raises(SourceChangedError, match="episode metadata"):
+        minari.load_dataset("test/lazy-v0")
+
+
+def test_folders_of_other_hosts_are_left_alone(tmp_path: Path) -> None:
+    dead = 2**22 + 1  # beyond the largest process id
+    ours, other = (tmp_path / f"stage-{host}-{dead}-abc" for host in (platform.node(), f"{platform.node()}-gpu"))
+    ours.mkdir()
+    other.mkdir()
+    new = owned_folder("stage-", tmp_path)
+    assert sorted(tmp_path.iterdir()) == sorted([new, other])

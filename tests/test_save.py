@@ -7,14 +7,21 @@ from pathlib import Path
 import minari
 import numpy as np
 import pytest
+from gymnasium import spaces
 from minari import EpisodeData
+from minari.data_collector import EpisodeBuffer
 
 from oat_gym import OAT, AugmentedDataset, Function
 from oat_gym.errors import ConfigurationError, DatasetExistsError, InvalidDataError, SourceChangedError
 from oat_gym.provenance import Provenance
+from tests.conftest import install_dataset
 
 MakeDataset = Callable[..., minari.MinariDataset]
 LENGTHS = [3, 7, 1, 5]
+
+
+def same(episode: EpisodeData, rng: np.random.Generator) -> EpisodeData:
+    return episode
 
 
 def noisy(episode: EpisodeData, rng: np.random.Generator) -> EpisodeData:
@@ -44,6 +51,50 @@ def test_what_is_loaded_is_what_was_iterated(make_dataset: MakeDataset, source_f
     ):
         assert Provenance.from_metadata(got, 0) == Provenance.from_metadata(made, 0)
         assert (got["seed"], got["options"]) == (made["seed"], made["options"])
+
+
+@pytest.mark.parametrize("data_format", ["arrow", "parquet"])
+def test_an_episode_too_long_for_a_format_is_refused(data_format: str) -> None:
+    def walk(length: int) -> EpisodeBuffer:
+        return EpisodeBuffer(
+            observations=np.arange(length + 1, dtype=np.float32)[:, None],
+            actions=np.zeros((length, 1), dtype=np.float32),
+            rewards=np.arange(length, dtype=np.float64),
+            terminations=np.zeros(length, dtype=bool),
+            truncations=np.arange(length) == length - 1,
+        )
+
+    box = spaces.Box(-np.inf, np.inf, (1,))
+    longest = AugmentedDataset(install_dataset("test/long-v0", [walk(32_766)], box, box), Function(same), factor=1)
+    loaded = longest.save("test/kept-v0", data_format=data_format)
+    np.testing.assert_array_equal(loaded[0].observations, longest[0].observations)
+    long = AugmentedDataset(install_dataset("test/long-v1", [walk(3), walk(32_767)], box, box), Function(same))
+    message = "Episode 1 has 32767 steps .* Save it with data_format='hdf5'"
+    with pytest.raises(InvalidDataError, match=message):
+        long.save("test/cut-v0", data_format=data_format)
+    assert "test/cut-v0" not in minari.list_local_datasets()
+
+
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow", "parquet"])
+def test_infos_without_a_row_of_the_reset_are_padded_where_they_must_be_and_it_is_told(data_format: str) -> None:
+    buffer = EpisodeBuffer(
+        observations=np.zeros((5, 1), dtype=np.float32),
+        actions=np.zeros((4, 1), dtype=np.float32),
+        rewards=np.zeros(4),
+        terminations=np.zeros(4, dtype=bool),
+        truncations=np.arange(4) == 3,
+        infos={"clock": np.arange(1.0, 5.0)},
+    )
+    box = spaces.Box(-1, 1, (1,))
+    data = AugmentedDataset(install_dataset("test/short-v0", [buffer, buffer], box, box), Function(same), factor=2)
+    loaded = data.save("test/padded-v0", data_format=data_format)
+    for episode, metadata in zip(loaded, loaded.storage.get_episode_metadata(range(4)), strict=True):
+        padded = data_format != "hdf5"
+        assert metadata.get("infos_rows") == (4 if padded else None)
+        assert np.asarray(episode.infos["clock"]).tolist() == [1.0] * padded + [1.0, 2.0, 3.0, 4.0]
+    again = AugmentedDataset(loaded, Function(same), factor=1).save("test/again-v0")
+    assert np.asarray(again[0].infos["clock"])[-4:].tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert next(iter(again.storage.get_episode_metadata([0]))).get("infos_rows") == metadata.get("infos_rows")
 
 
 def test_steps_are_marked_on_demand(make_dataset: MakeDataset) -> None:
@@ -141,7 +192,7 @@ def test_a_changed_source_is_an_error(
     (path.parent / "metadata.json").write_text(
         json.dumps(json.loads((path.parent / "metadata.json").read_text()) | {"total_episodes": 11})
     )
-    with pytest.raises(SourceChangedError, match="episodes"):
+    with pytest.raises(SourceChangedError, match="episode metadata"):
         minari.load_dataset("test/lazy-v0")
 
 
@@ -169,15 +220,18 @@ def test_what_has_no_recipe_is_refused(make_dataset: MakeDataset, walk_dataset: 
         ({"augmenter": {"name": "oat", "settings": {"class": "OAT"}}}, "Expected the settings of OAT"),
         ({"count": "many"}, "count must be an integer"),
         (
-            {"source": {"id": "../../etc-v0", "episodes": None, "content": "0" * 64}},
+            {"source": {"id": "../../etc-v0", "episodes": None, "content": "0" * 64, "metadata": "0" * 64}},
             "is no dataset id|not on this machine",
         ),
         (
-            {"source": {"id": "/etc/passwd-v0", "episodes": None, "content": "0" * 64}},
+            {"source": {"id": "/etc/passwd-v0", "episodes": None, "content": "0" * 64, "metadata": "0" * 64}},
             "is no dataset id|not on this machine",
         ),
         ({"source": {"id": "test/walks-v0", "episodes": None, "content": ""}}, "SHA-256"),
-        ({"source": {"id": "test/walks-v0", "episodes": [99], "content": "0" * 64}}, "names episodes that"),
+        (
+            {"source": {"id": "test/walks-v0", "episodes": [99], "content": "0" * 64, "metadata": "0" * 64}},
+            "names episodes that",
+        ),
         ({"source": 3}, "damaged or no recipe"),
         ({"seed": -4}, "seed must be"),
         ({"count": 3}, "says 24 episodes"),

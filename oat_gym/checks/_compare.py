@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from minari import EpisodeData
 
+from oat_gym.episodes import plain_infos
+
 FIELDS = ("observations", "actions", "rewards", "terminations", "truncations", "infos")
 
 
@@ -31,6 +33,29 @@ def tree_difference(left: Any, right: Any, where: str) -> str | None:
             return f"{where} has {len(left)} entries against {len(right)}"
         return _first_difference((a, b, f"{where}[{i}]") for i, (a, b) in enumerate(zip(left, right, strict=True)))
     return _leaf_difference(left, right, where)
+
+
+def saved_infos_difference(got: Any, expected: Any, rows: int | None) -> str | None:
+    """Return where infos that were saved differ from what they were, None where they do not.
+
+    Args:
+        got: the infos that were read back.
+        expected: the infos that were saved.
+        rows: the number of rows that may have got a copy of the first one before them (`infos_rows`); None: no such.
+    """
+    return _saved_difference(plain_infos(got or {}), plain_infos(expected or {}), rows, "infos")
+
+
+def _saved_difference(got: Any, expected: Any, rows: int | None, where: str) -> str | None:
+    if isinstance(got, dict) or isinstance(expected, dict):
+        if not isinstance(got, dict) or not isinstance(expected, dict) or got.keys() != expected.keys():
+            return f"{where} has other keys"
+        parts = (_saved_difference(got[key], expected[key], rows, f"{where}[{key!r}]") for key in expected)
+        return next(filter(None, parts), None)
+    found, wanted = np.asarray(got), np.asarray(expected)
+    if rows is not None and len(wanted) == rows and len(found) == rows + 1:
+        wanted = np.concatenate([wanted[:1], wanted])
+    return tree_difference(found, wanted, where)
 
 
 def _first_difference(pairs: Iterable[tuple[Any, Any, str]]) -> str | None:

@@ -6,6 +6,7 @@ or absent. On opening, every file is checked against its digest; a damaged set i
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import logging
@@ -89,9 +90,11 @@ class _Files:
         self.entries[name]["shape"][0] += len(rows)
 
     def close(self) -> None:
-        for name, file in self._open.items():
-            self.entries[name]["sha256"] = self._digests[name].hexdigest()
-            with file:
+        with contextlib.ExitStack() as stack:  # closes every file, also where the disk refuses one
+            for file in self._open.values():
+                stack.enter_context(file)
+            for name, file in self._open.items():
+                self.entries[name]["sha256"] = self._digests[name].hexdigest()
                 file.flush()
                 os.fsync(file.fileno())
 

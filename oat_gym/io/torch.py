@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
 from oat_gym._rng import check_seed
 from oat_gym.errors import ConfigurationError
 from oat_gym.io._batches import TorchBatch

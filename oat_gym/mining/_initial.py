@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import warnings
 
 import numpy as np
@@ -19,10 +20,8 @@ _MAX_MIXTURE_ROWS = 20_000
 
 def load_scikit_learn() -> None:
     """Import what this module uses of scikit-learn; a limit on threads holds only for libraries loaded before it."""
-    import sklearn.cluster
-    import sklearn.decomposition
-    import sklearn.metrics
-    import sklearn.mixture  # noqa: F401
+    for module in ("cluster", "decomposition", "metrics", "mixture"):
+        importlib.import_module(f"sklearn.{module}")
 
 
 def kmeans_labels(rows: Rows, *, n_clusters: int, seed: int) -> Ints:

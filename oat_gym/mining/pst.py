@@ -231,7 +231,8 @@ def mine(
         if length < 1:
             raise InvalidDataError(
                 f'length="auto" looks for windows that {wanted} of the {len(labels)} series share (auto_share='
-                f"{config.auto_share:g}), and not even single rows do. Lower auto_share, use fewer clusters, or give a length."
+                f"{config.auto_share:g}), and not even single rows do. "
+                "Lower auto_share, use fewer clusters, or give a length."
             )
     curve = support_curve(labels, aligned=config.aligned)
     table = count_tdss(labels, length, aligned=config.aligned)

@@ -16,7 +16,10 @@ from oat_gym import dataset as dataset_module
 from oat_gym import storage as storage_module
 from oat_gym.augmenters.base import Variation
 from oat_gym.checks import CHECKS, ChecksFailed, check_dataset
+from oat_gym.checks import dataset as checks_module
+from oat_gym.checks._compare import saved_infos_difference
 from oat_gym.errors import ConfigurationError, ConformanceError, InvalidDataError
+from oat_gym.export import write_dataset
 from oat_gym.storage import AugmentedStorage
 
 MakeDataset = Callable[..., minari.MinariDataset]
@@ -337,6 +340,10 @@ class ForgetsTheLast(AugmentedStorage):
     """Announces one episode less than its plan has."""
 
     @property
+    def total_episodes(self) -> int:
+        return super().total_episodes - 1
+
+    @property
     def metadata(self) -> dict[str, Any]:
         metadata = super().metadata
         return metadata | {"total_episodes": metadata["total_episodes"] - 1, "total_steps": metadata["total_steps"] - 7}
@@ -417,6 +424,29 @@ def test_sound_datasets_pass(make_dataset: MakeDataset, data_format: str) -> Non
         nothing = {name for name, count in report.counts.items() if count == 0}
         assert nothing <= {"outside-spans", "infos-kept"}  # no synthetic episode, or nothing outside its spans
         assert report.counts["saving"] == 3 * len(data)
+
+
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
+def test_infos_that_are_saved_with_other_values_are_told(
+    make_dataset: MakeDataset, data_format: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = make_dataset(LENGTHS)
+
+    def write(path: Any, name: str, episodes: Iterable[tuple[EpisodeData, dict[str, Any]]], **settings: Any) -> None:
+        spoilt = ((dataclasses.replace(e, infos=e.infos | {"clock": e.infos["clock"] + 1}), m) for e, m in episodes)
+        write_dataset(path, name, spoilt, **settings)
+
+    monkeypatch.setattr(checks_module, "write_dataset", write)
+    with pytest.raises(ChecksFailed, match=r"comes back with other infos: infos\['clock'\] at row 0"):
+        check_dataset(real, formats=(data_format,))
+
+
+def test_a_padding_of_infos_is_allowed_where_it_is_noted() -> None:
+    short, padded = {"a": np.array([3.0, 4.0])}, {"a": np.array([3.0, 3.0, 4.0])}
+    assert saved_infos_difference(padded, short, 2) is None
+    assert saved_infos_difference(short, short, None) is None
+    for got, rows in ((padded, None), ({"a": np.array([0.0, 3.0, 4.0])}, 2), ({"b": padded["a"]}, 2), ({}, 2)):
+        assert saved_infos_difference(got, short, rows)
 
 
 def test_oat_passes(walk_dataset: minari.MinariDataset, tiny_oat: OAT) -> None:

@@ -21,6 +21,7 @@ from oat_gym import AugmentedDataset, Function
 from oat_gym.errors import ConfigurationError, InvalidDataError, UnsupportedSpaceError
 from oat_gym.io import consumers
 from oat_gym.io.consumers import to_d3rlpy, to_torchrl
+from oat_gym.io.d4rl import write_d4rl
 from tests.conftest import install_dataset
 
 LENGTHS = (3, 1, 6, 4)
@@ -45,6 +46,11 @@ def test_with_the_real_library(library, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert library in json.loads(done.stdout.splitlines()[-1])
+    example = Path(__file__).parents[2] / "examples" / "03_torchrl_d3rlpy.py"
+    shown = subprocess.run([interpreter, str(example)], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    line = {"torchrl": "TorchRL: ", "d3rlpy": "d3rlpy: "}[library]
+    assert any(text.startswith(line) for text in shown.stdout.splitlines()), shown.stdout
 
 
 @pytest.fixture
@@ -167,6 +173,14 @@ def test_a_missing_library_is_named(function, module, make_dataset, monkeypatch)
         function(make_dataset(LENGTHS))
 
 
+def test_a_d4rl_file_is_a_source(given, tmp_path):
+    box = spaces.Box(-1, 1, (2,))
+    path = write_d4rl(simple(box, box), tmp_path / "simple.hdf5")
+    for source in (path, str(path), "test/simple-v0"):
+        assert given(source)["rewards"].tolist() == [0, 1, 2, 0, 1, 2]
+        assert consumers._columns(source, flat=False).n_steps == 6
+
+
 def test_what_is_no_dataset_is_an_error(given):
-    with pytest.raises(ConfigurationError, match="A Minari dataset or the id of one"):
+    with pytest.raises(ConfigurationError, match="A Minari dataset, the id of one"):
         given([1, 2])

@@ -1,6 +1,8 @@
 """D4RL's layout: exact round trips, D4RL's own reading conventions, and a named error for everything else."""
 
 import doctest
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -539,6 +541,30 @@ def test_a_failed_or_overtaken_write_leaves_nothing(tmp_path, monkeypatch, momen
     monkeypatch.setattr(f"oat_gym.io._d4rl_file.os.{moment}", fail)
     with pytest.raises(OSError, match=r"refused|already there"):
         write_d4rl(data, path)
+    assert [p.name for p in tmp_path.iterdir()] == ["set"]
+
+
+def test_a_full_disk_is_a_clear_error_and_no_crash(tmp_path):
+    data = make(tmp_path / "set", [300], ["timeout"])
+    script = """
+import resource, sys
+import minari, oat_gym
+from oat_gym.errors import SaveError
+data = minari.MinariDataset(sys.argv[1])
+for size in (0, 300, 5000):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    try:
+        oat_gym.write_d4rl(data, sys.argv[2])
+    except SaveError as error:
+        print(error)
+"""
+    path = tmp_path / "x.hdf5"
+    command = [sys.executable, "-c", script, str(data.storage.data_path), str(path)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, (run.returncode, run.stderr)
+    told = run.stdout.splitlines()
+    assert len(told) == 3
+    assert all(f"{path} could not be written" in line and "Free some space" in line for line in told)
     assert [p.name for p in tmp_path.iterdir()] == ["set"]
 
 

@@ -3,6 +3,7 @@
 import doctest
 import json
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -14,10 +15,17 @@ from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
 from oat_gym import OAT, AugmentedDataset, Function, MiningConfig
-from oat_gym.errors import ConfigurationError, InvalidDataError, UnsupportedSpaceError
+from oat_gym.errors import (
+    ConfigurationError,
+    DatasetNotFoundError,
+    InvalidDataError,
+    SaveError,
+    UnsupportedSpaceError,
+)
 from oat_gym.generation import BehaviorConfig, VAEMDPConfig
 from oat_gym.io import _loader, _loader_config, _memory_map
 from oat_gym.io import torch as loaders
+from oat_gym.io.d4rl import write_d4rl
 from oat_gym.io.torch import to_torch
 from tests.conftest import install_dataset
 
@@ -286,7 +294,60 @@ def test_batches_go_over_epochs(augmented):
     expected = [batch for _ in range(4) for batch in reference]
     assert all_same([*loader.batches(3), *loader.batches(len(expected) - 3)], expected)
     with pytest.raises(ConfigurationError, match="count must be"):
-        next(loader.batches(0))
+        loader.batches(0)
+
+
+def test_the_order_of_an_epoch_is_drawn_once(augmented, monkeypatch):
+    loader = to_torch(augmented, batch_size=4)
+    drawn = []
+    draw = loader._order
+    monkeypatch.setattr(loader, "_order", lambda epoch: drawn.append(epoch) or draw(epoch))
+    taken = [next(loader.batches(1)) for _ in range(len(loader) + 2)]
+    assert drawn == [0, 1]
+    assert all_same(taken, to_torch(augmented, batch_size=4).batches(len(loader) + 2))
+
+
+@pytest.mark.parametrize(("epoch", "batch"), [(-1, 0), (0, -1), (0, 99), (0, None), ("1", 0), (True, 0)])
+def test_a_state_of_no_place_is_refused(augmented, epoch, batch):
+    loader = to_torch(augmented, batch_size=5)
+    last = len(loader) - 1
+    with pytest.raises(ConfigurationError, match=f"names batch {batch!r} of epoch {epoch!r}; expected"):
+        loader.load_state_dict(loader.state_dict() | {"epoch": epoch, "batch": batch})
+    loader.load_state_dict(loader.state_dict() | {"epoch": 2, "batch": last})
+    assert len(list(loader)) == 1
+
+
+def test_a_full_disk_is_a_clear_error(augmented, tmp_path):
+    augmented.fit()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50, hard))
+    try:
+        with pytest.raises(SaveError, match=r"could not be kept in .*columns .*Free some space.* memory_map"):
+            to_torch(augmented, memory_map=tmp_path / "columns")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert all_same(to_torch(augmented, memory_map=tmp_path / "columns"), to_torch(augmented))
+    (tmp_path / "taken").write_text("mine")
+    with pytest.raises(SaveError, match=r"could not be kept in .*taken"):
+        to_torch(augmented, memory_map=tmp_path / "taken")
+
+
+def test_a_d4rl_file_is_a_source(tmp_path):
+    box = spaces.Box(-1, 1, (2,))
+    steps = 3
+    buffer = EpisodeBuffer(
+        observations=np.zeros((steps + 1, 2), dtype=np.float32),
+        actions=np.zeros((steps, 2), dtype=np.float32),
+        rewards=np.arange(steps, dtype=np.float64),
+        terminations=np.zeros(steps, dtype=bool),
+        truncations=np.arange(steps) == steps - 1,
+    )
+    data = install_dataset("test/flat-v0", [buffer, buffer], box, box)
+    path = write_d4rl(data, tmp_path / "flat.hdf5")
+    for source in (path, str(path), "test/flat-v0"):
+        assert joined(to_torch(source))["rewards"].tolist() == [0, 1, 2, 0, 1, 2]
+    with pytest.raises(DatasetNotFoundError, match="no file"):
+        to_torch(tmp_path / "absent.hdf5")
 
 
 def test_iterations_at_once_are_epochs_of_their_own(augmented):
@@ -500,7 +561,7 @@ def test_settings_that_cannot_work_are_errors(make_dataset, settings, message, m
 
 
 def test_what_is_no_dataset_is_an_error():
-    with pytest.raises(ConfigurationError, match="reads a Minari dataset"):
+    with pytest.raises(ConfigurationError, match="A Minari dataset, the id of one, or the path"):
         to_torch([1, 2, 3])
 
 

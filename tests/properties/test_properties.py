@@ -130,7 +130,7 @@ def batch(space: spaces.Space, rows: int, rng: np.random.Generator) -> Any:  # n
     return (scale * rng.uniform(-1, 1, size=(rows, *space.shape))).astype(space.dtype)
 
 
-INFOS = ("none", "floats", "flags", "counts", "words", "matrix", "nested", "tall")
+INFOS = ("none", "floats", "flags", "counts", "words", "matrix", "nested", "tall", "short")
 
 
 def info(kind: str, rows: int, rng: np.random.Generator) -> Any:
@@ -142,7 +142,13 @@ def info(kind: str, rows: int, rng: np.random.Generator) -> Any:
         "matrix": lambda: rng.normal(size=(rows, 2, 2)),
         "nested": lambda: {"x": rng.normal(size=(rows, 1)), "deeper": {"y": list(rng.normal(size=rows))}},
         "tall": lambda: rng.integers(0, 9, size=(rows, 3)).astype(np.int32),
+        "short": lambda: list(rng.normal(size=rows)),
     }[kind]()
+
+
+def info_rows(kind: str, length: int, data_format: str) -> int:
+    """T rows (no row of the reset) for "short" infos, which Minari's arrow storage refuses; else T+1."""
+    return length if kind == "short" and data_format == "hdf5" else length + 1
 
 
 @dataclass(frozen=True)
@@ -183,7 +189,7 @@ def make(recipe: Recipe) -> minari.MinariDataset:
                 rewards=rng.integers(-5, 5, size=length).astype(recipe.reward_dtype),
                 terminations=last & terminates,
                 truncations=last & (not terminates),
-                infos={kind: info(kind, length + 1, rng) for kind in recipe.infos},
+                infos={kind: info(kind, info_rows(kind, length, recipe.data_format), rng) for kind in recipe.infos},
                 **(extra if recipe.described else {}),
             )
         )
