@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import warnings
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,11 @@ _MAX_FEATURES = 60
 _MAX_MIXTURE_ROWS = 20_000
 
 
-def load_scikit_learn() -> None:
-    """Import what this module uses of scikit-learn; a limit on threads holds only for libraries loaded before it."""
-    for module in ("cluster", "decomposition", "metrics", "mixture"):
-        importlib.import_module(f"sklearn.{module}")
+def load_scikit_learn() -> tuple[ModuleType, ...]:
+    """Import what this package uses of scikit-learn; a limit on threads holds only for libraries loaded before it."""
+    from sklearn import cluster, decomposition, metrics, mixture
+
+    return cluster, decomposition, metrics, mixture
 
 
 def kmeans_labels(rows: Rows, *, n_clusters: int, seed: int) -> Ints:
