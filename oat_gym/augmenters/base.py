@@ -73,7 +73,11 @@ class Augmenter(ABC):
 
     @abstractmethod
     def fit(self, source: Source, *, seed: int, progress: ProgressCallback = silent) -> Sampler:
-        """Learn from `source` and return the sampler of stream `seed`. Raises an `OatGymError` where it cannot work."""
+        """Learn from `source` and return the sampler of stream `seed`. Raises an `OatGymError` where it cannot work.
+
+        A seed and not a generator: what is restored from the cache in another process, and any variation (i, k) in
+        any order, must draw the same numbers, so that each part derives its own stream (`oat_gym._rng.derive`).
+        """
 
     def restore(self, source: Source, arrays: Arrays, value: Any, *, seed: int) -> Sampler:
         """Return the sampler whose `state()` was (arrays, value); by default it is fitted anew."""
