@@ -59,16 +59,15 @@ def choose_clusters(
     def fit(count: int, seed: int, init: Initialisation, report: Progress) -> TICC:
         return _fit(series, count, settings, seed=seed, times=times, init=init, progress=report)
 
-    n_rows = sum(len(item) for item in map(np.asarray, series))
-    if max(candidates) > n_rows:
+    rows = join_series(series)
+    if max(candidates) > len(rows.values):
         raise ConfigurationError(
-            f"The largest number of clusters to try, {max(candidates)}, is more than the {n_rows} rows of all series: "
+            f"The largest number of clusters to try, {max(candidates)}, is more than the {len(rows.values)} rows of all series: "
             "give smaller candidates, or n_clusters."
         )
     load_scikit_learn()
     if len(candidates) == 1:
         return fit(candidates[0], seeds[0], settings.init, report), {}
-    rows = join_series(series)
     sample = np.sort(rng.permutation(len(rows.values))[:_SILHOUETTE_ROWS])
     models: dict[int, list[TICC]] = {}
     scores: dict[int, list[float]] = {}
