@@ -90,7 +90,10 @@ def test_losing_a_race_leaves_the_winner(tmp_path, monkeypatch):
         ({"terminations": np.zeros(2, dtype=bool)}, "2 terminations"),
         ({"actions": np.full((3, 1), 1.01, dtype=np.float32)}, "actions of episode 1 are not all in Box"),
         ({"observations": {"a": np.full((4, 2), np.nan), "b": np.zeros(4, dtype=int)}}, r"1\['a'\] are not all"),
-        ({"observations": {"a": np.zeros((4, 3)), "b": np.zeros(4, dtype=int)}}, r"observations\['a'\] of shape \(3,\) a step"),
+        (
+            {"observations": {"a": np.zeros((4, 3)), "b": np.zeros(4, dtype=int)}},
+            r"observations\['a'\] of shape \(3,\) a step",
+        ),
         ({"observations": {"a": np.zeros((4, 2)), "b": np.full(4, 5)}}, r"1\['b'\] are not all in Discrete"),
         ({"rewards": np.zeros(0)}, "no steps"),
     ],
