@@ -62,8 +62,8 @@ def choose_clusters(
     rows = join_series(series)
     if max(candidates) > len(rows.values):
         raise ConfigurationError(
-            f"The largest number of clusters to try, {max(candidates)}, is more than the {len(rows.values)} rows of all "
-            "series: give smaller candidates, or n_clusters."
+            f"The largest number of clusters to try, {max(candidates)}, is more than the {len(rows.values)} rows of "
+            "all series: give smaller candidates, or n_clusters."
         )
     load_scikit_learn()
     if len(candidates) == 1:
