@@ -31,11 +31,19 @@ from oat_gym.io.d4rl import is_d4rl_path, read_d4rl
 from oat_gym.mining import MiningResult
 from oat_gym.progress import ProgressCallback
 from oat_gym.provenance import Provenance
-from oat_gym.recipe import APPENDED, EPISODE_METADATA_FILE, RECIPE_FILE, check_if_augmented, find_dataset, write_recipe
+from oat_gym.recipe import (
+    APPENDED,
+    EPISODE_METADATA_FILE,
+    RECIPE_FILE,
+    check_if_augmented,
+    find_dataset,
+    write_metadata,
+    write_recipe,
+)
 from oat_gym.serialization import source_metadata
 from oat_gym.source import Source
 from oat_gym.spaces import FlatSpace
-from oat_gym.storage import AugmentedStorage, register, write_metadata
+from oat_gym.storage import AugmentedStorage, register
 from oat_gym.synthesis import Synthesis
 
 

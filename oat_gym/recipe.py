@@ -16,17 +16,17 @@ import h5py
 import minari
 import numpy as np
 from minari import MinariDataset
-from minari.dataset.minari_dataset import parse_dataset_id
+from minari.dataset.minari_dataset import MinariDatasetSpec, parse_dataset_id
 from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
 from minari.serialization import deserialize_space
 from minari.storage import get_dataset_path
 
 from oat_gym.augmenters import AUGMENTERS
-from oat_gym.cache import FORMAT_VERSION, canonical
+from oat_gym.cache import FORMAT_VERSION, canonical, write_atomically
 from oat_gym.embedded import EMBEDDED, embedded_path
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError, OatGymError, SourceChangedError
 from oat_gym.provenance import METADATA_KEYS
-from oat_gym.serialization import config_from_json, read_json
+from oat_gym.serialization import config_from_json, read_json, source_metadata
 from oat_gym.source import Source
 from oat_gym.synthesis import Synthesis
 
@@ -138,6 +138,25 @@ def write_recipe(synthesis: Synthesis) -> bytes:
         "seed": synthesis.seed,
     }
     return json.dumps(recipe, indent=1).encode()
+
+
+def write_metadata(
+    path: pathlib.Path,
+    synthesis: Synthesis,
+    *,
+    dataset_id: str | None = None,
+    totals: MinariDatasetSpec | None = None,
+) -> None:
+    """Write `metadata.json` of an augmented dataset: the source's keys, with an id, totals and a format of its own."""
+    dataset = synthesis.source.dataset
+    metadata = source_metadata(dataset) | {
+        "total_episodes": totals.total_episodes if totals else synthesis.n_real + synthesis.count,
+        "total_steps": totals.total_steps if totals else int(synthesis.lengths.sum()),
+        "data_format": DATA_FORMAT,
+        "dataset_id": dataset_id or dataset.id,
+        "dataset_size": dataset.storage.get_size(),
+    }
+    write_atomically(path / METADATA_FILE_NAME, json.dumps(metadata).encode())
 
 
 def open_recipe(data_path: pathlib.Path) -> Synthesis | None:

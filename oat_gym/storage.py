@@ -26,7 +26,6 @@ import numpy.typing as npt
 from minari import EpisodeData
 from minari.data_collector import EpisodeBuffer
 from minari.dataset._storages import _registry  # pyright: ignore[reportPrivateUsage]
-from minari.dataset.minari_dataset import MinariDatasetSpec
 from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
 
 from oat_gym._staging import owned_folder
@@ -45,8 +44,9 @@ from oat_gym.recipe import (
     RECIPE_FILE,
     check_if_augmented,
     open_recipe,
+    write_metadata,
 )
-from oat_gym.serialization import metadata_to_json, source_metadata
+from oat_gym.serialization import metadata_to_json
 from oat_gym.source import Source
 from oat_gym.synthesis import Synthesis
 
@@ -107,7 +107,7 @@ class AugmentedStorage(MinariStorage):
         if self.synthesis is None or str(self.data_path) not in _live:
             return _read, (str(self.data_path),)
         plan = self.synthesis
-        overlay = _Overlay(self._appended_buffers(), self.edited_metadata())
+        overlay: _Overlay = self._appended_buffers(), self.edited_metadata()
         return _reopen, (str(self.data_path), overlay, plan.source.view, plan.augmenter, plan.count, plan.seed)
 
     def _appended_buffers(self) -> list[EpisodeBuffer]:
@@ -190,8 +190,7 @@ class AugmentedStorage(MinariStorage):
             return self._source_provenance(number)
         j = number - self.n_real
         i, k = j % self.n_real, j // self.n_real
-        new = variation or synthesis.variation(j)
-        spans = merge_spans(self._source_provenance(i).spans, new.spans)
+        spans = merge_spans(self._source_provenance(i).spans, (variation or synthesis.variation(j)).spans)
         return Provenance(True, i, k, spans, int(synthesis.lengths[number]))
 
     def get_episode_metadata(self, episode_indices: Iterable[int]) -> Iterator[dict[str, Any]]:
@@ -364,25 +363,6 @@ def register() -> None:
     _registry[DATA_FORMAT] = lambda: AugmentedStorage
 
 
-def write_metadata(
-    path: pathlib.Path,
-    synthesis: Synthesis,
-    *,
-    dataset_id: str | None = None,
-    totals: MinariDatasetSpec | None = None,
-) -> None:
-    """Write `metadata.json` of an augmented dataset: the source's keys, with an id, totals and a format of its own."""
-    dataset = synthesis.source.dataset
-    metadata = source_metadata(dataset) | {
-        "total_episodes": totals.total_episodes if totals else synthesis.n_real + synthesis.count,
-        "total_steps": totals.total_steps if totals else int(synthesis.lengths.sum()),
-        "data_format": DATA_FORMAT,
-        "dataset_id": dataset_id or dataset.id,
-        "dataset_size": dataset.storage.get_size(),
-    }
-    write_atomically(path / METADATA_FILE_NAME, json.dumps(metadata).encode())
-
-
 def _attach(path: pathlib.Path, synthesis: Synthesis, *, owned: bool) -> None:
     _live[str(path)] = synthesis
     if owned:
@@ -394,12 +374,8 @@ def _remove(path: str, pid: int) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Overlay:
-    """What was added to a live dataset: appended episodes, and edits of metadata."""
-
-    appended: list[EpisodeBuffer]
-    edits: dict[str, dict[str, Any]]
+_Overlay = tuple[list[EpisodeBuffer], dict[str, dict[str, Any]]]
+"""What was added to a live dataset: appended episodes, and edits of metadata."""
 
 
 def _read(path: str) -> MinariStorage:
@@ -414,10 +390,11 @@ def _reopen(path: str, overlay: _Overlay, *plan: Any) -> MinariStorage:
     synthesis = Synthesis(Source(dataset), augmenter, count=count, seed=seed)
     if not pathlib.Path(path).exists():
         storage = AugmentedStorage.of(synthesis)
-        if overlay.appended:
-            storage.update_episodes(overlay.appended)
-        if overlay.edits:
-            storage.update_episode_metadata(overlay.edits.values(), map(int, overlay.edits))
+        appended, edits = overlay
+        if appended:
+            storage.update_episodes(appended)
+        if edits:
+            storage.update_episode_metadata(edits.values(), map(int, edits))
         return storage
     _attach(pathlib.Path(path), synthesis, owned=False)
     return MinariStorage.read(path)
