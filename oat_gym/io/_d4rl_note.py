@@ -62,7 +62,8 @@ class Note:
         """Return the observation and the action space."""
         try:
             return deserialize_space(self.observation_space), deserialize_space(self.action_space)
-        except Exception as error:
+        # Gymnasium asserts what its spaces need; NotImplementedError is Minari's answer to an unknown space.
+        except (ArithmeticError, AssertionError, LookupError, NotImplementedError, TypeError, ValueError) as error:
             raise InvalidDataError(f"{NOTE!r} names spaces that cannot be read: {error!r}.") from error
 
 

@@ -224,16 +224,7 @@ def mine(
         progress=progress,
     )
     labels = model.labels_
-    length = config.length
-    if length == "auto":
-        wanted = int(np.ceil(config.auto_share * len(labels) - 1e-9))
-        length = longest_length(labels, wanted, aligned=config.aligned)
-        if length < 1:
-            raise InvalidDataError(
-                f'length="auto" looks for windows that {wanted} of the {len(labels)} series share (auto_share='
-                f"{config.auto_share:g}), and not even single rows do. "
-                "Lower auto_share, use fewer clusters, or give a length."
-            )
+    length = _window_length(labels, config)
     curve = support_curve(labels, aligned=config.aligned)
     table = count_tdss(labels, length, aligned=config.aligned)
     curve[length] = int(table.support.max())
@@ -250,6 +241,21 @@ def mine(
         n_too_short=int((table.lengths < length).sum()),
         min_support=xi,
     )
+
+
+def _window_length(labels: Sequence[Ints], config: MiningConfig) -> int:
+    """Return W: the given one, or for "auto" the largest that enough series share."""
+    if config.length != "auto":
+        return config.length
+    wanted = int(np.ceil(config.auto_share * len(labels) - 1e-9))
+    length = longest_length(labels, wanted, aligned=config.aligned)
+    if length < 1:
+        raise InvalidDataError(
+            f'length="auto" looks for windows that {wanted} of the {len(labels)} series share (auto_share='
+            f"{config.auto_share:g}), and not even single rows do. Lower auto_share, use fewer clusters, "
+            "or give a length."
+        )
+    return length
 
 
 def check_long_enough(series: Sequence[ArrayLike], config: MiningConfig) -> None:

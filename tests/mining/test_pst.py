@@ -177,3 +177,9 @@ def test_distinct_sets_are_not_one_set_moved_by_a_row():
     starts = sorted(int(item.occurrences[0, 1]) for item in distinct)
     assert len(starts) == 3
     assert all(b - a >= 8 for a, b in pairwise(starts))
+
+
+def test_auto_length_without_any_shared_row_is_an_error():
+    series = [np.full((6, 1), 10.0 * k) + np.random.default_rng(k).normal(size=(6, 1)) for k in range(4)]
+    with pytest.raises(InvalidDataError, match="not even single rows do"):
+        run(series, n_clusters=4, length="auto", switch_penalty=1.0)
