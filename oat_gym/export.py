@@ -31,8 +31,7 @@ from oat_gym.spaces import map_tree, tree_length
 DataFormat = Literal["hdf5", "arrow", "parquet"]
 DATA_FORMATS: tuple[DataFormat, ...] = ("hdf5", "arrow", "parquet")
 
-# Written by the storage itself, or true of the source only.
-_OWN_KEYS = {
+STORAGE_KEYS = {
     "total_episodes",
     "total_steps",
     "dataset_size",
@@ -40,9 +39,9 @@ _OWN_KEYS = {
     "jpeg_encoding",
     "observation_space",
     "action_space",
-    "env_spec",
-    "dataset_id",
 }
+"""The metadata that a storage writes itself."""
+_OWN_KEYS = STORAGE_KEYS | {"env_spec", "dataset_id"}
 
 
 _STAGING = ".oat_gym-"

@@ -10,21 +10,11 @@ from minari import EpisodeData, MinariDataset
 
 from oat_gym.episodes import BoolArray, check_episode, next_states, plain_infos, states
 from oat_gym.errors import InvalidDataError
+from oat_gym.export import STORAGE_KEYS
 from oat_gym.io import _d4rl_note as notes
 from oat_gym.io._d4rl_file import Array, Flat, plain_value
 from oat_gym.io._d4rl_rows import rows_of, spaces_of
 from oat_gym.serialization import metadata_to_json, source_metadata
-
-# Written by the storage itself, or noted apart.
-_LEFT_OUT = {
-    "total_episodes",
-    "total_steps",
-    "dataset_size",
-    "data_format",
-    "jpeg_encoding",
-    "observation_space",
-    "action_space",
-}
 
 
 def columns_of(data: MinariDataset) -> Flat:
@@ -128,7 +118,7 @@ def _timeouts(episode: EpisodeData) -> BoolArray:
 
 def _note_of(data: MinariDataset, raw: Mapping[str, Any], episodes: list[EpisodeData]) -> notes.Note:
     ends = [(bool(e.terminations[-1]), bool(e.truncations[-1])) for e in episodes]
-    metadata = {key: value for key, value in raw.items() if key not in _LEFT_OUT}
+    metadata = {key: value for key, value in raw.items() if key not in STORAGE_KEYS}
     if isinstance(metadata.get("d4rl"), Mapping):
         metadata["d4rl"] = {key: value for key, value in metadata["d4rl"].items() if key != "metadata"}
     per_episode = data.storage.get_episode_metadata(data.episode_indices)
