@@ -49,5 +49,9 @@ class AugmentationWarning(UserWarning):
     """The augmented dataset is sound, but less was generated than its size suggests."""
 
 
+class EstimationWarning(UserWarning):
+    """An estimate was made, and there is a reason not to trust it."""
+
+
 class ConformanceError(OatGymError, AssertionError):
     """A dataset, augmenter or estimator broke its contract (see `oat_gym.checks`)."""

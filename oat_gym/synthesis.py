@@ -52,7 +52,7 @@ class Synthesis:
         """Steps of each episode, the real ones first: (N + count,)."""
         numbers = np.arange(self.count)
         i, k = numbers % self.n_real, numbers // self.n_real
-        planned = self.augmenter.lengths(self.source.lengths, i, k, seed=self.seed) if self.count else numbers
+        planned = self.augmenter.lengths(self.source, i, k, seed=self.seed) if self.count else numbers
         return np.concatenate([self.source.lengths, np.asarray(planned, dtype=np.int64)])
 
     @property
@@ -93,7 +93,7 @@ class Synthesis:
     def _fit(self, progress: ProgressCallback) -> None:
         variations = range(-(-self.count // self.n_real))
         augmenter, source = self.augmenter, self.source
-        if not augmenter.cacheable:
+        if not (augmenter.cacheable and augmenter.trains):
             sampler = augmenter.fit(source, seed=self.seed, progress=progress)
             self._material = [sampler.decode(sampler.generate(k)) for k in variations]
             self._sampler = sampler

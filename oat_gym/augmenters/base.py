@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 from minari import EpisodeData
 
 from oat_gym.cache import Arrays
@@ -23,12 +25,15 @@ class Variation:
     """One synthetic episode.
 
     `episode` shares no memory with the source; `spans` are its generated steps; `next_states` holds the next states
-    that differ from `observations[t+1]` (the paper's literal seam), batches of one row keyed by step.
+    that differ from `observations[t+1]` (the paper's literal seam), batches of one row keyed by step. `log_prob` (T,)
+    is that of the generated actions under the policy that drew them, NaN at recorded steps; None for methods that
+    have no such policy.
     """
 
     episode: EpisodeData
     spans: tuple[Span, ...]
     next_states: dict[int, Batch] = field(default_factory=dict[int, Batch])
+    log_prob: npt.NDArray[np.float64] | None = None
 
 
 class Sampler(ABC):
@@ -65,10 +70,21 @@ class Augmenter(ABC):
     """Base of all augmenters: a frozen dataclass, so that its repr rebuilds it and its fields identify the cache."""
 
     name: ClassVar[str]
+    trains: ClassVar[bool] = True
+    """Whether `fit` takes long enough for its result to be kept on disk."""
+    expected_failures: ClassVar[Mapping[str, str]] = {}
+    """Checks of `oat_gym.checks.check_augmenter` that the method cannot pass, and the reason of each."""
+
+    @property
+    def at_zero_strength(self) -> Augmenter | None:
+        """The same method at zero strength, whose variations equal their sources; None where none of its settings
+        is a strength.
+        """
+        return None
 
     @property
     def cacheable(self) -> bool:
-        """Whether the fitted state is worth keeping on disk, and the settings have a JSON form to find it by."""
+        """Whether the settings have a JSON form, which tells one result from another on disk and in recipes."""
         return True
 
     @abstractmethod
@@ -86,6 +102,9 @@ class Augmenter(ABC):
     def check(self, source: Source) -> None:  # noqa: B027  (most methods have no demand of their own)
         """Raise an `OatGymError` where spaces or lengths rule the method out; reads no episode."""
 
-    def lengths(self, source_lengths: IntArray, episodes: IntArray, variations: IntArray, *, seed: int) -> IntArray:
-        """Return the number of steps of each variation (episodes[j], variations[j]), before anything is generated."""
-        return np.asarray(source_lengths)[episodes]
+    def lengths(self, source: Source, episodes: IntArray, variations: IntArray, *, seed: int) -> IntArray:
+        """Return the number of steps of each variation (episodes[j], variations[j]), before anything is generated.
+
+        It is called when a dataset is opened, so it trains nothing; by default the lengths of the source episodes.
+        """
+        return source.lengths[episodes]

@@ -34,6 +34,7 @@ class Function(Augmenter):
     """
 
     name: ClassVar[str] = "function"
+    trains: ClassVar[bool] = False
     function: Callable[[EpisodeData, np.random.Generator], EpisodeData]
 
     def __post_init__(self) -> None:
@@ -42,7 +43,7 @@ class Function(Augmenter):
 
     @property
     def cacheable(self) -> bool:
-        """False: a function has no fingerprint."""
+        """False: a function has no JSON form."""
         return False
 
     def fit(self, source: Source, *, seed: int, progress: ProgressCallback = silent) -> Sampler:
