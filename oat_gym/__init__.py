@@ -10,9 +10,20 @@ Importing the package teaches Minari the data format "oat" (see `oat_gym.dataset
 
 import importlib.metadata
 
-from oat_gym import checks, domains, mining
+from oat_gym import checks, domains, mining, ope
 from oat_gym.augmenters import AUGMENTERS, Augmenter, Function
+from oat_gym.augmenters.compose import Compose
+from oat_gym.augmenters.dgw import DGW
+from oat_gym.augmenters.jittering import Jittering
+from oat_gym.augmenters.mixture import Mixture
 from oat_gym.augmenters.oat import OAT
+from oat_gym.augmenters.permutation import Permutation
+from oat_gym.augmenters.scaling import Scaling
+from oat_gym.augmenters.spawner import SPAWNER
+from oat_gym.augmenters.tda import TDA
+from oat_gym.augmenters.timegan import TimeGAN
+from oat_gym.augmenters.vae import VAE
+from oat_gym.augmenters.vae_mdp import VAEMDP
 from oat_gym.dataset import AugmentedDataset, augment, install
 from oat_gym.episodes import Transitions
 from oat_gym.io.consumers import to_d3rlpy, to_torchrl
@@ -28,15 +39,26 @@ install()
 
 __all__ = [
     "AUGMENTERS",
+    "DGW",
     "OAT",
+    "SPAWNER",
+    "TDA",
+    "VAE",
+    "VAEMDP",
     "AugmentedDataset",
     "Augmenter",
+    "Compose",
     "Function",
+    "Jittering",
     "LoaderConfig",
     "MiningConfig",
     "MiningResult",
+    "Mixture",
+    "Permutation",
     "Provenance",
+    "Scaling",
     "Span",
+    "TimeGAN",
     "TorchBatch",
     "TorchLoader",
     "Transitions",
@@ -44,6 +66,7 @@ __all__ = [
     "checks",
     "domains",
     "mining",
+    "ope",
     "read_d4rl",
     "to_d3rlpy",
     "to_torch",

@@ -16,7 +16,7 @@ import os
 import secrets
 import warnings
 from collections.abc import Generator, Mapping
-from dataclasses import asdict, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -273,4 +273,4 @@ def _digest(arrays: Mapping[str, npt.NDArray[Any]], text: str) -> str:
 
 
 def _fields(value: Any) -> dict[str, Any]:
-    return {name: getattr(value, name) for name in asdict(value)}
+    return {field.name: getattr(value, field.name) for field in fields(value)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -79,12 +79,17 @@ def has_provenance(metadata: Mapping[str, Any]) -> bool:
     return isinstance(metadata, LazyMetadata) or all(key in metadata for key in METADATA_KEYS)
 
 
-def merge_spans(old: tuple[Span, ...], new: tuple[Span, ...]) -> tuple[Span, ...]:
-    """Return the generated spans of an episode whose `new` spans were put over one that had `old` ones."""
-    if not old:
-        return new
+def merge_spans(old: tuple[Span, ...], new: tuple[Span, ...], *, length: int) -> tuple[Span, ...]:
+    """Return the generated spans of an episode of `length` steps whose `new` spans were put over one with `old` ones.
+
+    What the old ones had beyond the new length is gone.
+
+    >>> [(span.start, span.stop) for span in merge_spans((Span(0, 9),), (Span(2, 4),), length=6)]
+    [(0, 6), (2, 4)]
+    """
+    inside = [replace(span, stop=min(span.stop, length)) for span in old if span.start < length]
     covered = set[int]().union(*(range(span.start, span.stop) for span in new)) if new else set[int]()
-    kept = [span for span in old if not covered.issuperset(range(span.start, span.stop))]
+    kept = [span for span in inside if not covered.issuperset(range(span.start, span.stop))]
     return tuple(sorted((*kept, *new), key=lambda span: (span.start, span.stop)))
 
 

@@ -1,7 +1,7 @@
 """Recipes: a few kB that describe an augmented dataset, and how a source is found again.
 
 A recipe names its source by Minari id and content hash, never by a path, and its augmenter by its name in
-`AUGMENTERS` and its settings; reading one runs no code but the package's own. A folder that someone else made is
+`METHODS` and its settings; reading one runs no code but the package's own. A folder that someone else made is
 checked before anything in it is followed (`check_folder`).
 """
 
@@ -22,6 +22,10 @@ from minari.serialization import deserialize_space
 from minari.storage import get_dataset_path
 
 from oat_gym.augmenters import AUGMENTERS
+from oat_gym.augmenters._parts import methods_in
+from oat_gym.augmenters.base import Augmenter
+from oat_gym.augmenters.compose import Compose
+from oat_gym.augmenters.mixture import Mixture
 from oat_gym.cache import FORMAT_VERSION, canonical, write_atomically
 from oat_gym.embedded import EMBEDDED, embedded_path
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError, OatGymError, SourceChangedError
@@ -36,6 +40,9 @@ APPENDED = "appended"
 EPISODE_METADATA_FILE = "episode_metadata.json"
 LIVE_RECIPE = {"live": True}
 """Stands in a temporary directory, which is of use only to the process that made it."""
+
+METHODS: dict[str, type[Augmenter]] = {**AUGMENTERS, Compose.name: Compose, Mixture.name: Mixture}
+"""What a recipe can name: every method, and what is made of them."""
 
 _MAX_CHAIN = 16
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -105,11 +112,12 @@ def write_recipe(synthesis: Synthesis) -> bytes:
             augmenter that is the user's own code, or a setting that JSON does not give back.
     """
     augmenter, dataset = synthesis.augmenter, synthesis.source.dataset
-    if AUGMENTERS.get(augmenter.name) is not type(augmenter) or not augmenter.cacheable:
-        raise ConfigurationError(
-            f"A recipe names a method of oat_gym.AUGMENTERS ({', '.join(AUGMENTERS)}), and {augmenter!r} is not one: "
-            "save the episodes themselves (lazy=False)."
-        )
+    for method in reversed([*methods_in(augmenter)]):  # the parts before what is made of them
+        if METHODS.get(method.name) is not type(method) or not method.cacheable:
+            raise ConfigurationError(
+                f"A recipe names methods of oat_gym.AUGMENTERS ({', '.join(METHODS)}), and {method!r} is not one: "
+                "save the episodes themselves (lazy=False)."
+            )
     try:
         found = find_dataset(dataset.id)
     except DatasetNotFoundError as error:
@@ -121,7 +129,7 @@ def write_recipe(synthesis: Synthesis) -> bytes:
         )
     settings = canonical(augmenter)
     try:
-        config_from_json(type(augmenter), json.loads(json.dumps(settings)))
+        config_from_json(type(augmenter), json.loads(json.dumps(settings)), known=tuple(METHODS.values()))
     except InvalidDataError as error:
         raise ConfigurationError(f"{augmenter!r} cannot be kept in a recipe: {error}") from error
     everything = np.array_equal(synthesis.source.ids, np.arange(found.storage.total_episodes))
@@ -193,12 +201,12 @@ def open_recipe(data_path: pathlib.Path) -> Synthesis | None:
 
 def _plan_of(recipe: dict[str, Any], path: pathlib.Path) -> Synthesis:
     name, origin = recipe["augmenter"]["name"], recipe["source"]
-    if not isinstance(name, str) or name not in AUGMENTERS:
-        raise InvalidDataError(f"{path} names the augmenter {name!r}; known are {', '.join(AUGMENTERS)}.")
+    if not isinstance(name, str) or name not in METHODS:
+        raise InvalidDataError(f"{path} names the augmenter {name!r}; known are {', '.join(METHODS)}.")
     for key in ("content", "metadata"):
         if not isinstance(origin[key], str) or not _SHA256.fullmatch(origin[key]):
             raise InvalidDataError(f"{path} gives {origin[key]!r} for the SHA-256 of its source's {key}.")
-    augmenter = config_from_json(AUGMENTERS[name], recipe["augmenter"]["settings"])
+    augmenter = config_from_json(METHODS[name], recipe["augmenter"]["settings"], known=tuple(METHODS.values()))
     _check_chain(path)
     dataset, episodes = find_dataset(origin["id"]), origin["episodes"]
     if episodes is not None:

@@ -33,10 +33,11 @@ def read_json(path: Path) -> Any:
         ) from error
 
 
-def config_from_json(cls: type[Any], value: Mapping[str, Any]) -> Any:
+def config_from_json(cls: type[Any], value: Mapping[str, Any], *, known: tuple[type[Any], ...] = ()) -> Any:
     """Return the frozen dataclass `cls` whose canonical JSON (`oat_gym.cache.canonical`) is `value`.
 
-    Nested dataclasses are those that the field's annotation names; lists become tuples.
+    Nested dataclasses are those that the field's annotation names, or one of `known` where the annotation names a
+    base class of it; lists become tuples. No other class is ever looked up.
 
     Raises:
         InvalidDataError: if `value` is not of this class or a field is missing, unknown, of another type than its
@@ -47,23 +48,33 @@ def config_from_json(cls: type[Any], value: Mapping[str, Any]) -> Any:
         raise InvalidDataError(f"Expected the settings of {cls.__name__} ({', '.join(sorted(names))}), got {value!r}.")
     hints = typing.get_type_hints(cls)
     try:
-        return cls(**{name: _field_from_json(hints[name], value[name]) for name in names})
+        return cls(**{name: _field_from_json(hints[name], value[name], known) for name in names})
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise InvalidDataError(f"The settings of {cls.__name__} cannot be read: {error}") from error
 
 
-def _field_from_json(hint: Any, value: Any) -> Any:
+def _field_from_json(hint: Any, value: Any, known: tuple[type[Any], ...]) -> Any:
     if isinstance(value, Mapping):
-        candidates = [hint, *typing.get_args(hint)]
-        for candidate in candidates:
-            if dataclasses.is_dataclass(candidate) and getattr(candidate, "__name__", "") == value.get("class"):
-                return config_from_json(typing.cast("type[Any]", candidate), value)
-        raise InvalidDataError(f"Unknown settings {value.get('class')!r} for a field of type {hint}.")
+        return _nested_from_json(hint, value, known)
+    if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+        items = typing.get_args(hint)
+        if typing.get_origin(hint) is not tuple or items[1:] != (...,):
+            raise InvalidDataError(f"Settings in a list are given where {hint} is expected.")
+        return tuple(_field_from_json(items[0], item, known) for item in value)
     if isinstance(value, list):
         value = _tuples(value)
     if not _fits(hint, value):
         raise InvalidDataError(f"A setting has the value {value!r}, and {hint} is expected.")
     return value
+
+
+def _nested_from_json(hint: Any, value: Mapping[str, Any], known: tuple[type[Any], ...]) -> Any:
+    named = [hint, *typing.get_args(hint)]
+    bases = tuple(one for one in named if isinstance(one, type))
+    for candidate in (*named, *(one for one in known if issubclass(one, bases))):
+        if dataclasses.is_dataclass(candidate) and getattr(candidate, "__name__", "") == value.get("class"):
+            return config_from_json(typing.cast("type[Any]", candidate), value, known=known)
+    raise InvalidDataError(f"Unknown settings {value.get('class')!r} for a field of type {hint}.")
 
 
 def _tuples(value: Any) -> Any:

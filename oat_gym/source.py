@@ -6,6 +6,7 @@ import copy
 import hashlib
 import json
 import warnings
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Any
 
@@ -175,6 +176,51 @@ class Source:
             _finite(np.asarray(episode.rewards, dtype=np.float64), "reward", number)
             for number, episode in enumerate(self.episodes)
         ]
+
+
+class DerivedSource(Source):
+    """Episodes in memory that were made from those of another source, one from each, in its spaces and order.
+
+    Metadata and dataset are those of the other source. `make` is called once, when the episodes are first asked for;
+    `lengths` are known before.
+    """
+
+    def __init__(self, origin: Source, lengths: IntArray, make: Callable[[], Iterable[EpisodeData]]) -> None:
+        super().__init__(origin.dataset)
+        self._origin = origin
+        self._lengths = lengths
+        self._make = make
+
+    @cached_property
+    def ids(self) -> IntArray:
+        """The storage ids of the episodes that these were made from, (N,)."""
+        return self._origin.ids
+
+    @cached_property
+    def metadata(self) -> tuple[dict[str, Any], ...]:
+        """What the storage keeps for the episodes that these were made from."""
+        return self._origin.metadata
+
+    @cached_property
+    def lengths(self) -> IntArray:
+        """The number of steps of each episode, (N,)."""
+        return self._lengths
+
+    @cached_property
+    def episodes(self) -> tuple[EpisodeData, ...]:
+        """All episodes, checked against the T+1 rule and the lengths that were announced."""
+        episodes = tuple(self._make())
+        for number, episode in enumerate(episodes):
+            check_episode(episode, self.observation_space, self.action_space)
+            self.check_length(number, len(episode.rewards))
+        return episodes
+
+    def check_length(self, number: int, length: int) -> None:
+        """Raise `InvalidDataError` unless `length`, what was made, is what was announced for episode `number`."""
+        if length != self.lengths[number]:
+            raise InvalidDataError(
+                f"Episode {number} was made with {length} steps where its augmenter announced {self.lengths[number]}."
+            )
 
 
 def _rename_clashes(metadata: dict[str, Any]) -> dict[str, Any]:

@@ -190,8 +190,8 @@ class AugmentedStorage(MinariStorage):
             return self._source_provenance(number)
         j = number - self.n_real
         i, k = j % self.n_real, j // self.n_real
-        spans = merge_spans(self._source_provenance(i).spans, (variation or synthesis.variation(j)).spans)
-        return Provenance(True, i, k, spans, int(synthesis.lengths[number]))
+        length, new = int(synthesis.lengths[number]), (variation or synthesis.variation(j)).spans
+        return Provenance(True, i, k, merge_spans(self._source_provenance(i).spans, new, length=length), length)
 
     def get_episode_metadata(self, episode_indices: Iterable[int]) -> Iterator[dict[str, Any]]:
         """Yield the source's metadata of each episode with its provenance (see `Provenance.to_metadata`)."""

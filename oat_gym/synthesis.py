@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -95,7 +96,9 @@ class Synthesis:
         augmenter, source = self.augmenter, self.source
         if not (augmenter.cacheable and augmenter.trains):
             sampler = augmenter.fit(source, seed=self.seed, progress=progress)
-            self._material = [sampler.decode(sampler.generate(k)) for k in variations]
+            self._material = [
+                sampler.decode(sampler.generate(k)) for k in _told("Generating variations", variations, progress)
+            ]
             self._sampler = sampler
             return
         entry = CacheEntry(self.cache_key)
@@ -106,7 +109,10 @@ class Synthesis:
                 entry.write("model", *stored)
             # The sampler always comes from its stored form: a first run and a later one are the same run.
             sampler = augmenter.restore(source, *stored, seed=self.seed)
-            self._material = [self._variation_material(entry, sampler, k) for k in variations]
+            self._material = [
+                self._variation_material(entry, sampler, k)
+                for k in _told("Generating variations", variations, progress)
+            ]
         self._sampler = sampler
 
     def _variation_material(self, entry: CacheEntry, sampler: Sampler, k: int) -> Any:
@@ -125,3 +131,11 @@ class Synthesis:
             augmenter=[self.augmenter.name, canonical(self.augmenter)],
             seed=self.seed,
         )
+
+
+def _told(description: str, numbers: range, progress: ProgressCallback) -> Iterator[int]:
+    """Yield the numbers and report how many are done."""
+    for number in numbers:
+        progress(description, number, len(numbers))
+        yield number
+    progress(description, len(numbers), len(numbers))

@@ -77,9 +77,7 @@ class Augmenter(ABC):
 
     @property
     def at_zero_strength(self) -> Augmenter | None:
-        """The same method at zero strength, whose variations equal their sources; None where none of its settings
-        is a strength.
-        """
+        """The same method at zero strength, whose variations equal their sources; None where no setting is one."""
         return None
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -35,6 +35,7 @@ class Function(Augmenter):
 
     name: ClassVar[str] = "function"
     trains: ClassVar[bool] = False
+    expected_failures: ClassVar[Mapping[str, str]] = {"zero-strength": "how much a function changes is not a setting"}
     function: Callable[[EpisodeData, np.random.Generator], EpisodeData]
 
     def __post_init__(self) -> None:

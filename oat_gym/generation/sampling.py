@@ -49,6 +49,8 @@ class Samples:
             without a policy.
         lengths: (n,) number of steps until the sampled end; W for a model without an end head. Steps behind it are
             to be cut off.
+        end_logits: (n, W) logit of p(end|z_{t+1}), that the episode ends with step t; minus infinity for a model
+            without an end head.
     """
 
     states: FloatArray
@@ -56,6 +58,7 @@ class Samples:
     rewards: FloatArray
     log_prob: FloatArray
     lengths: npt.NDArray[np.int64]
+    end_logits: FloatArray
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,7 @@ class FittedVAEMDP:
         start_states: npt.NDArray[np.floating[Any]] | None = None,
         limits: Limits | None = None,
         observation_noise: bool = True,
+        steps: int | None = None,
     ) -> Samples:
         """Roll out `count` new spans: z_1, then s_t ~ p(s_t|z_t), a_t ~ beta(a_t|s_t), z_{t+1} ~ p(.|z_t, a_t), ...
 
@@ -108,20 +112,22 @@ class FittedVAEMDP:
             limits: generated real values are clipped to these; by default to the training spans' widened range.
             observation_noise: draw states, rewards and ends from their distributions (the paper); if false, take
                 means and most likely categories. Latent states and actions are drawn in either case.
+            steps: roll out so many steps in place of W: the same as the first ones of a longer roll-out.
 
         Raises:
             ConfigurationError: if neither a policy nor actions are given, or `start` and `start_states` disagree.
             InvalidDataError: if an array's shape is wrong, or a policy returns wrong or non-finite actions.
             TrainingError: if a generated value is not finite; the message names the set.
         """
-        self._check_arguments(count, policy, actions, start, start_states)
+        steps = self.steps if steps is None else steps
+        self._check_arguments(count, steps, policy=policy, actions=actions, start=start, start_states=start_states)
         generator = torch_generator(rng)
         with one_thread(), torch.no_grad():
             roll = _RollOut(self, generator if observation_noise else None, limits or self.limits)
             z = self._start(count, generator, start_states)
             carry = self.network.first_carry(z)
-            states, chosen, rewards, scores, ends = [roll.state(z)], [], [], [], []
-            for step in range(self.steps):
+            states, chosen, rewards, scores, ends, logits = [roll.state(z)], [], [], [], [], []
+            for step in range(steps):
                 recorded = None if actions is None else actions[:, step]
                 action, score = roll.action(states[-1], policy, recorded, rng)
                 gaussian, carry = self.network.transition(self.weights, z, self._normalized(1, action), carry)
@@ -130,8 +136,10 @@ class FittedVAEMDP:
                 chosen.append(action)
                 rewards.append(roll.reward(z))
                 scores.append(score)
-                ends.append(roll.end(z))
-        return self._finished(states, chosen, rewards, scores, ends)
+                logit = roll.end_logit(z)
+                logits.append(logit.numpy().astype(np.float64))
+                ends.append(roll.end(logit))
+        return self._finished(states, chosen, rewards, scores, ends=ends, logits=logits)
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return everything but the configuration and the name as named arrays, to store without pickle."""
@@ -191,6 +199,8 @@ class FittedVAEMDP:
     def _check_arguments(
         self,
         count: int,
+        steps: int,
+        *,
         policy: ActionPolicy | None,
         actions: npt.NDArray[np.floating[Any]] | None,
         start: str,
@@ -198,6 +208,8 @@ class FittedVAEMDP:
     ) -> None:
         if count < 1:
             raise ConfigurationError(f"count must be at least 1, got {count}.")
+        if not 1 <= steps <= self.steps:
+            raise ConfigurationError(f"steps must be 1 to {self.steps}, as long as what was trained on; got {steps}.")
         if policy is None and actions is None:
             raise ConfigurationError("A roll-out needs a policy that chooses actions, or recorded actions to replay.")
         if start not in ("prior", "posterior") or (start == "posterior") != (start_states is not None):
@@ -206,7 +218,7 @@ class FittedVAEMDP:
                 f"{'without' if start_states is None else 'with'} start_states."
             )
         shapes = {
-            "actions": (actions, (count, self.steps, self.network.action_layout.width)),
+            "actions": (actions, (count, steps, self.network.action_layout.width)),
             "start_states": (start_states, (count, self.network.state_layout.width)),
         }
         for what, (values, shape) in shapes.items():
@@ -219,12 +231,19 @@ class FittedVAEMDP:
         actions: list[FloatMatrix],
         rewards: list[FloatArray],
         scores: list[FloatArray],
+        *,
         ends: list[npt.NDArray[np.bool_]],
+        logits: list[FloatArray],
     ) -> Samples:
         ended = np.stack(ends, axis=1)
-        lengths = np.where(ended.any(axis=1), ended.argmax(axis=1) + 1, self.steps).astype(np.int64)
+        lengths = np.where(ended.any(axis=1), ended.argmax(axis=1) + 1, len(ends)).astype(np.int64)
         samples = Samples(
-            np.stack(states, axis=1), np.stack(actions, axis=1), np.stack(rewards, 1), np.stack(scores, 1), lengths
+            states=np.stack(states, axis=1),
+            actions=np.stack(actions, axis=1),
+            rewards=np.stack(rewards, axis=1),
+            log_prob=np.stack(scores, axis=1),
+            lengths=lengths,
+            end_logits=np.stack(logits, axis=1),
         )
         for what, values in (("state", samples.states), ("action", samples.actions), ("reward", samples.rewards)):
             if not np.isfinite(values).all():
@@ -256,11 +275,17 @@ class _RollOut:
         drawn = self.model.network.reward_head.sample(output, self.generator)[0]
         return np.clip(self.model.normalizers[2].denormalize(drawn.cpu().numpy())[:, 0], *self.limits.rewards)
 
-    def end(self, z: Tensor) -> npt.NDArray[np.bool_]:
-        """Return whether the episode ends here, drawn from p(end|z_t), (n,)."""
+    def end_logit(self, z: Tensor) -> Tensor:
+        """Return the logit of p(end|z_t), (n,); minus infinity without an end head."""
         if not self.model.network.ends:
-            return np.zeros(z.shape[1], dtype=bool)
-        probability = mlp(self.model.weights, "decoder.end", z)[0, :, 0].sigmoid().cpu()
+            return torch.full((z.shape[1],), -torch.inf)
+        return mlp(self.model.weights, "decoder.end", z)[0, :, 0].cpu()
+
+    def end(self, logit: Tensor) -> npt.NDArray[np.bool_]:
+        """Return whether the episode ends here, (n,)."""
+        if not self.model.network.ends:
+            return np.zeros(len(logit), dtype=bool)
+        probability = logit.sigmoid()
         if self.generator is None:
             return (probability > 0.5).numpy()
         return (torch.rand(probability.shape, generator=self.generator, dtype=torch.float32) < probability).numpy()

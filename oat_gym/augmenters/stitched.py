@@ -1,0 +1,182 @@
+"""The second half of OAT, for any windows: one VAE-MDP for each set of windows, its samples stitched back."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, Self, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from oat_gym._rng import derive
+from oat_gym.augmenters.base import Variation
+from oat_gym.augmenters.generative import (
+    GenerativeAugmenter,
+    GenerativeSampler,
+    Learned,
+    Matrices,
+    check_choice,
+    with_prefix,
+)
+from oat_gym.augmenters.spans import Occurrence, Placement, SpanSamples, place_spans, seam_jumps
+from oat_gym.cache import Arrays
+from oat_gym.episodes import IntArray
+from oat_gym.errors import AugmentationWarning, InvalidDataError
+from oat_gym.generation import Sequences, VAEMDPConfig
+from oat_gym.generation.config import check_integer
+from oat_gym.source import Source
+from oat_gym.spaces import Batch
+from oat_gym.stitching import Seam, Span, literal_next_states, stitch_into, stitchable_copy
+
+Actions = Literal["behavior", "recorded"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StitchingAugmenter(GenerativeAugmenter):
+    """The settings of a method that replaces windows of episodes by samples; `OAT` says what they mean."""
+
+    actions: Actions = "behavior"
+    seam: Seam = "contiguous"
+    candidates: int = 16
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("actions", self.actions, get_args(Actions))
+        check_choice("seam", self.seam, get_args(Seam))
+        check_integer("candidates", self.candidates, at_least=1)
+
+    @classmethod
+    def preset(cls, preset: Literal["default", "paper"]) -> Self:
+        """Return a named configuration: "default", or "paper" (appendix B.2: literal seams, 100 updates of 4 spans)."""
+        return cls() if preset == "default" else cls(model=VAEMDPConfig.from_preset(preset), seam="literal")
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The windows of `length` steps that are modelled and replaced.
+
+    `sets[g]` is the (M_g, 2) array of (episode, first step) of set g, the sets in the order in which they are placed;
+    `names` is how messages call them.
+    """
+
+    length: int
+    sets: tuple[IntArray, ...]
+    names: tuple[str, ...]
+
+    def sequences(self, data: Matrices) -> list[Sequences]:
+        """Return what the VAE-MDP of each set is trained on."""
+        width = self.length
+        return [
+            Sequences(
+                states=np.stack([data.states[i][t : t + width + 1] for i, t in rows]),
+                actions=np.stack([data.actions[i][t : t + width] for i, t in rows]),
+                rewards=np.stack([data.rewards[i][t : t + width] for i, t in rows]),
+                groups=rows[:, 0],
+                name=name,
+            )
+            for rows, name in zip(self.sets, self.names, strict=True)
+        ]
+
+    def placements(self, k: int, n_source: int) -> list[Placement]:
+        """Return where variation `k` of each of `n_source` episodes gets which set; spans never overlap."""
+        return [place_spans(self.sets, i, k, self.length) for i in range(n_source)]
+
+    def warn_of_copies(self, n_source: int, *, reason: str, advice: str) -> None:
+        """Warn with an `AugmentationWarning` of episodes that hold no window, if there are any."""
+        without = n_source - len(np.unique(np.concatenate([rows[:, 0] for rows in self.sets])))
+        if without:
+            warnings.warn(
+                f"{without} of {n_source} episodes {reason}: their synthetic episodes are exact copies of them. "
+                f"{advice}",
+                AugmentationWarning,
+                stacklevel=3,
+            )
+
+
+def check_length(source: Source, length: int, *, advice: str) -> None:
+    """Raise `InvalidDataError` unless some episode has `length` steps; `advice` may name `{half}` the median length."""
+    lengths = source.lengths
+    if lengths.max() < length:
+        median = np.median(lengths)
+        raise InvalidDataError(
+            f"No episode is as long as a sub-trajectory of {length} steps: the {len(source)} episodes have "
+            f"{lengths.min()} to {lengths.max()} steps (median {median:g}). "
+            + advice.format(half=max(1, int(median) // 2))
+        )
+
+
+class StitchedSampler(GenerativeSampler):
+    """Rolls out the VAE-MDP of each set of windows and stitches its samples into copies of the source episodes."""
+
+    def __init__(
+        self, config: StitchingAugmenter, source: Source, seed: int, *, windows: Windows, learned: Learned
+    ) -> None:
+        super().__init__(config, source, seed, learned=learned)
+        self._config = config
+        self.windows = windows
+
+    @cached_property
+    def _scale(self) -> npt.NDArray[np.float64]:
+        return np.concatenate(self._data.states).std(axis=0)
+
+    def generate(self, k: int) -> Arrays:
+        """Roll out, for variation `k`, one sample for each span that it places, a batch for each set."""
+        arrays: Arrays = {}
+        placements = self.windows.placements(k, len(self._source))
+        for g in range(len(self.windows.sets)):
+            rows = [(i, start) for i, placement in enumerate(placements) for h, start in placement if h == g]
+            if rows:
+                arrays |= {f"{g}/{name}": array for name, array in self._roll_out(g, k, rows).items()}
+        return arrays
+
+    def _roll_out(self, g: int, k: int, rows: list[Occurrence]) -> Arrays:
+        config, data, width = self._config, self._data, self.windows.length
+        recorded = np.stack([data.states[i][start : start + width + 1] for i, start in rows])
+        repeats = config.candidates if config.seam == "matched" else 1
+        actions = None
+        if config.actions == "recorded":
+            actions = np.stack([data.actions[i][start : start + width] for i, start in rows]).repeat(repeats, axis=0)
+        samples = self._learned.models[g].sample(
+            len(rows) * repeats,
+            rng=derive(self._seed, "sample", g, k),
+            policy=self._policy,
+            limits=self._limits,
+            actions=actions,
+            start=config.start,
+            observation_noise=config.observation_noise,
+            start_states=recorded[:, 0].repeat(repeats, axis=0) if config.start == "posterior" else None,
+        )
+        jumps = seam_jumps(samples.states, recorded.repeat(repeats, axis=0), self._scale)
+        best = jumps.sum(axis=1).reshape(len(rows), repeats).argmin(axis=1) + np.arange(len(rows)) * repeats
+        drawn = {name: getattr(samples, name)[best] for name in ("states", "actions", "rewards", "log_prob")}
+        return drawn | {"rows": np.array(rows), "seams": jumps[best]}
+
+    def decode(self, arrays: Arrays) -> dict[int, SpanSamples]:
+        """Return the samples of each set in the dataset's spaces."""
+        spaces = self._source.flat_observations, self._source.flat_actions
+        sets = {int(name.split("/")[0]) for name in arrays}
+        return {g: SpanSamples.decode(with_prefix(arrays, f"{g}/"), *spaces) for g in sorted(sets)}
+
+    def variation(self, i: int, k: int, material: dict[int, SpanSamples]) -> Variation:
+        """Stitch the samples of variation `k` into a copy of source episode `i`."""
+        original = self._source.episodes[i]
+        episode = stitchable_copy(original, number=i)
+        log_prob = np.full(len(episode.rewards), np.nan)
+        spans: list[Span] = []
+        before: dict[int, Batch] = {}
+        last: dict[int, Batch] = {}
+        for g, samples in material.items():
+            if i not in samples.row_of:
+                continue
+            span, replacement = samples.replacement(i, pst_set=g, number=k * len(self._source) + i)
+            stitch_into(episode, span, replacement)
+            log_prob[span.start : span.stop] = samples.log_prob[samples.row_of[i]]
+            spans.append(span)
+            if self._config.seam == "literal":
+                kept, generated = literal_next_states(original, span, replacement)
+                before |= kept
+                last |= generated
+        spans.sort(key=lambda span: span.start)
+        return Variation(episode, tuple(spans), before | last, log_prob)
