@@ -1,4 +1,4 @@
-"""Conformance checks: the contract of a dataset, held against one (no pytest needed).
+"""Conformance checks: the contract of a dataset, an augmenter or an estimator, held against one (no pytest needed).
 
 >>> import oat_gym
 >>> from oat_gym.checks import check_dataset
@@ -7,7 +7,19 @@
 3
 """
 
+from oat_gym.checks.augmenter import AUGMENTER_CHECKS, check_augmenter
 from oat_gym.checks.dataset import CHECKS, check_dataset
+from oat_gym.checks.estimator import ESTIMATOR_CHECKS, check_estimator
 from oat_gym.checks.report import Check, ChecksFailed, Report
 
-__all__ = ["CHECKS", "Check", "ChecksFailed", "Report", "check_dataset"]
+__all__ = [
+    "AUGMENTER_CHECKS",
+    "CHECKS",
+    "ESTIMATOR_CHECKS",
+    "Check",
+    "ChecksFailed",
+    "Report",
+    "check_augmenter",
+    "check_dataset",
+    "check_estimator",
+]

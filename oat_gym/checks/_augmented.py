@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from minari import EpisodeData, MinariDataset
 
-from oat_gym.augmenters.function import Function
 from oat_gym.checks._compare import difference, tree_difference
 from oat_gym.checks._subject import FileState, Subject
 from oat_gym.checks.report import Broken, Check, NotApplicable
@@ -73,12 +72,12 @@ def _rows(batch: Batch, rows: Any) -> Batch:
 
 
 def infos_kept(subject: Subject) -> int:
-    """A synthetic episode of its source's length has its source's infos (of a user's function: its schema)."""
+    """A synthetic episode of which a part counts as recorded has its source's infos; every one has their keys."""
     count = 0
-    only_schema = isinstance(subject.augmented.augmenter, Function)
-    for _, episode, original in _planned(subject, synthetic=True):
+    for position, episode, original in _planned(subject, synthetic=True):
         got, expected = episode.infos or {}, original.infos or {}
-        if only_schema or len(episode.rewards) != len(original.rewards):
+        made_whole = subject.augmented.provenance(position).mask.all()
+        if made_whole or len(episode.rewards) != len(original.rewards):
             if got.keys() != expected.keys():
                 raise Broken(f"episode {episode.id} has the infos {sorted(got)}, its source {sorted(expected)}")
         else:
@@ -245,7 +244,7 @@ AUGMENTED_CHECKS: tuple[Check[Subject], ...] = (
     Check("provenance", "provenance is that of the metadata", provenance, (*READ, "plan", "metadata-steps")),
     Check("masks", "a mask has one boolean for each step", masks, (*READ, "plan")),
     Check("outside-spans", "outside its spans an episode is its source", outside_spans, (*READ, "masks", "provenance")),
-    Check("infos-kept", "infos keep the source's schema", infos_kept, (*READ, "plan")),
+    Check("infos-kept", "infos keep the source's schema", infos_kept, (*READ, "plan", "masks")),
     Check("metadata-kept", "episode metadata survives", metadata_kept, (*READ, "plan")),
     Check("environment", "spaces, environments and scores are the source's", environment),
     Check("transitions", "transitions keep the T+1 rule", transitions, (*READ, "masks", *CONTENT)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -23,18 +23,22 @@ class NotApplicable(Exception):  # noqa: N818
 class Check(Generic[SubjectT]):
     """One rule: `function(subject)` returns how many things it looked at, or raises `Broken`.
 
-    Where a check of `needs` did not pass, this one is not run: its finding would only repeat the other's.
+    Where a check of `needs` did not pass, or one of `after` failed, this one is not run: its finding would only repeat
+    the other's.
     """
 
     name: str
     rule: str
     function: Callable[[SubjectT], int]
     needs: tuple[str, ...] = ()
+    after: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Report:
     """What the checks found: (name, count) of those that passed, (name, message) of the others.
+
+    `expected_failed` are those that were said beforehand to fail, each with the reason given and what was found.
 
     >>> report = Report("demo", passed=(("ids", 3),), skipped=(), failed=())
     >>> report.counts
@@ -47,6 +51,7 @@ class Report:
     passed: tuple[tuple[str, int], ...]
     skipped: tuple[tuple[str, str], ...]
     failed: tuple[tuple[str, str], ...]
+    expected_failed: tuple[tuple[str, str], ...] = ()
 
     @property
     def counts(self) -> dict[str, int]:
@@ -58,6 +63,7 @@ class Report:
         plural = "" if len(self.passed) == 1 else "s"
         lines = [f"{self.subject}: {len(self.passed)} check{plural} passed on {items} items"]
         lines += [f"  not run {name}: {reason}" for name, reason in self.skipped]
+        lines += [f"  failed as expected {name}: {message}" for name, message in self.expected_failed]
         lines += [f"  FAILED {name}: {message}" for name, message in self.failed]
         return "\n".join(lines)
 
@@ -70,30 +76,60 @@ class ChecksFailed(ConformanceError):  # noqa: N818  (an error by its base: Conf
         self.report = report
 
 
-def run_checks(subject_name: str, subject: SubjectT, checks: Sequence[Check[SubjectT]]) -> Report:
+def run_checks(
+    subject_name: str,
+    subject: SubjectT,
+    checks: Sequence[Check[SubjectT]],
+    *,
+    expected: Mapping[str, str] | None = None,
+) -> Report:
     """Run every check and return the report.
+
+    `expected` names checks that are to fail, each with the reason: one of them that passes, or that is no check, is
+    a failure.
 
     Raises:
         ChecksFailed: if one failed, after all of them were run.
     """
-    passed: list[tuple[str, int]] = []
-    skipped: list[tuple[str, str]] = []
-    failed: list[tuple[str, str]] = []
-    for check in checks:
-        missing = [name for name in check.needs if name in dict(failed) or name in dict(skipped)]
-        if missing:
-            reason = dict(skipped).get(missing[0], f"it builds on {missing[0]!r}, which failed")
-            skipped.append((check.name, reason))
-            continue
-        try:
-            passed.append((check.name, check.function(subject)))
-        except NotApplicable as reason:
-            skipped.append((check.name, str(reason)))
-        except Broken as finding:
-            failed.append((check.name, f"{finding} ({check.rule})"))
-        except Exception as error:  # what a dataset raises while it is checked is a finding, not our error
-            failed.append((check.name, f"it raised {type(error).__name__}: {error} ({check.rule})"))
-    report = Report(subject_name, tuple(passed), tuple(skipped), tuple(failed))
+    passed, skipped, findings = _run_all(subject, checks)
+    known = dict(expected or {})
+    unknown = {name: reason for name, reason in known.items() if name not in {check.name for check in checks}}
+    failed = [
+        *((name, finding) for name, finding in findings.items() if name not in known),
+        *((name, f"it was expected to fail ({known[name]}) but passed") for name in passed if name in known),
+        *((name, f"it was expected to fail ({why}), and no check has this name") for name, why in unknown.items()),
+    ]
+    report = Report(
+        subject_name,
+        passed=tuple((name, count) for name, count in passed.items() if name not in known),
+        skipped=tuple(skipped.items()),
+        failed=tuple(failed),
+        expected_failed=tuple((name, f"{known[name]} [{text}]") for name, text in findings.items() if name in known),
+    )
     if failed:
         raise ChecksFailed(report)
     return report
+
+
+def _run_all(
+    subject: SubjectT, checks: Sequence[Check[SubjectT]]
+) -> tuple[dict[str, int], dict[str, str], dict[str, str]]:
+    """Return the counts of the checks that passed, why others were not run, and what the rest found."""
+    passed: dict[str, int] = {}
+    skipped: dict[str, str] = {}
+    findings: dict[str, str] = {}
+    for check in checks:
+        missing = [name for name in check.needs if name in findings or name in skipped]
+        missing += [name for name in check.after if name in findings]
+        if missing:
+            skipped[check.name] = skipped.get(missing[0], f"it builds on {missing[0]!r}, which failed")
+            continue
+        try:
+            passed[check.name] = check.function(subject)
+        except NotApplicable as reason:
+            skipped[check.name] = str(reason)
+        except Broken as finding:
+            findings[check.name] = f"{finding} ({check.rule})"
+        except Exception as error:  # what a subject raises while it is checked is a finding, not our error
+            findings[check.name] = f"it raised {type(error).__name__}: {error} ({check.rule})"
+    return passed, skipped, findings

@@ -22,9 +22,13 @@ METHODS = {
 }
 
 
-# What never sees data from a file: the copy that `check_dataset` makes of an object in memory, and optional packages
-# that are imported by their fixed names.
-ALLOWED = {"checks/_access.py": {"import pickle"}, "io/consumers.py": {"importlib.import_module"}}
+# What never sees data from a file: the copies that `check_dataset` and `check_augmenter` make of objects in memory, and
+# optional packages that are imported by their fixed names.
+ALLOWED = {
+    "checks/_access.py": {"import pickle"},
+    "checks/_augmenter_settings.py": {"import pickle"},
+    "io/consumers.py": {"importlib.import_module"},
+}
 
 
 def forbidden(source: str) -> list[str]:
