@@ -31,6 +31,8 @@ class Logged:
         unit: (E,) the real episode, 0 to N-1, that an episode is or was made from. A resample of the data draws
             units, so that augmented copies never count as independent.
         synthetic: (E,) whether the episode is a generated one.
+        log_prob: (n,) log beta(a|s) as the data records it in `infos["log_prob"]`, NaN for generated steps, whose
+            actions no recorded policy chose; `None` where the data does not record it.
     """
 
     steps: Transitions
@@ -39,6 +41,7 @@ class Logged:
     offsets: IntArray
     unit: IntArray
     synthetic: BoolArray
+    log_prob: FloatArray | None = None
 
     @classmethod
     def of(cls, dataset: MinariDataset) -> Logged:
@@ -65,6 +68,7 @@ class Logged:
             offsets=np.concatenate(([0], np.cumsum(lengths))).astype(np.int64),
             unit=_units(origins, dataset.episode_indices),
             synthetic=synthetic,
+            log_prob=_recorded_log_prob(dataset, origins, steps.synthetic, lengths),
         )
         logged._check_finite()
         return logged
@@ -130,6 +134,36 @@ def _steps(dataset: MinariDataset, origins: list[Provenance]) -> Transitions:
 
     parts = zip(checked(dataset.iterate_episodes()), (origin.mask for origin in origins), strict=True)
     return collect_transitions(((episode, mask, {}) for episode, mask in parts), range(len(origins)))
+
+
+def _recorded_log_prob(
+    dataset: MinariDataset, origins: list[Provenance], generated: BoolArray, lengths: IntArray
+) -> FloatArray | None:
+    """Join `infos["log_prob"]` of all episodes; an episode that was generated whole is not read again for it."""
+    first = next(number for number, origin in enumerate(origins) if not origin.synthetic)
+    if "log_prob" not in (next(iter(dataset.iterate_episodes([int(dataset.episode_indices[first])]))).infos or {}):
+        return None
+    result = np.full(len(generated), np.nan)
+    stops = np.cumsum(lengths)
+    rows = [slice(stop - length, stop) for stop, length in zip(stops, lengths, strict=True)]
+    read = [number for number in range(len(rows)) if not generated[rows[number]].all()]
+    indices = [int(dataset.episode_indices[number]) for number in read]
+    for number, episode in zip(read, dataset.iterate_episodes(indices), strict=True):
+        result[rows[number]] = np.where(generated[rows[number]], np.nan, _step_log_prob(episode))
+    return result
+
+
+def _step_log_prob(episode: EpisodeData) -> FloatArray:
+    """Return (T,) log-probabilities; of T + 1 rows, as Minari's collector records, the first belongs to the reset."""
+    length, recorded = len(episode.rewards), (episode.infos or {}).get("log_prob")
+    raw = np.asarray([] if recorded is None else recorded, dtype=np.float64)
+    values = raw.reshape(len(raw), -1)
+    if len(values) not in (length, length + 1) or values.shape[1] != 1:
+        raise InvalidDataError(
+            f'Episode {episode.id} has infos["log_prob"] of shape {raw.shape}; one number for each of its '
+            f"{length} steps is expected (or {length + 1}, the first one for the reset)."
+        )
+    return values[-length:, 0]
 
 
 def _units(origins: list[Provenance], ids: npt.NDArray[np.integer]) -> IntArray:

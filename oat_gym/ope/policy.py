@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from functools import cached_property
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +46,37 @@ class DiscretePolicy(Policy, Protocol):
         ...
 
 
+class PolicyStack(Protocol):
+    """Q policies evaluated in one product; every result has a leading axis of Q."""
+
+    def sample(self, observations: Batch, *, rngs: Sequence[np.random.Generator]) -> Batch:
+        """Return actions, leaves (Q, n, ...); policy q draws from `rngs[q]` what it would draw alone."""
+        ...
+
+    def log_prob(self, observations: Batch, actions: Batch) -> FloatArray:
+        """Return log pi(a|s) of the same n actions under each policy, (Q, n)."""
+        ...
+
+    def mean(self, observations: Batch) -> Batch:
+        """Return the mean actions, leaves (Q, n, ...)."""
+        ...
+
+
+@runtime_checkable
+class StackablePolicy(Policy, Protocol):
+    """A policy that can be evaluated in one product with others of its architecture."""
+
+    @property
+    def architecture(self) -> Hashable:
+        """What policies must have in common to be stacked."""
+        ...
+
+    @classmethod
+    def stack(cls, policies: Sequence[Self]) -> PolicyStack:
+        """Return one computation for policies of one architecture."""
+        ...
+
+
 Policies = Mapping[str, Policy] | Sequence[Policy] | Policy
 """What `ope.evaluate` takes: a policy, several, or several by name."""
 
@@ -52,6 +84,8 @@ Policies = Mapping[str, Policy] | Sequence[Policy] | Policy
 @dataclass(frozen=True)
 class PolicySet:
     """P target policies that are evaluated together; every result has a leading axis of P.
+
+    Policies of one architecture (`StackablePolicy`) are evaluated in one batched product, the others one by one.
 
     >>> from oat_gym.ope import PolicySet, TabularPolicy
     >>> pair = PolicySet.of({"left": TabularPolicy([[1.0, 0.0]]), "either": TabularPolicy([[0.5, 0.5]])})
@@ -86,17 +120,21 @@ class PolicySet:
         return len(self.policies)
 
     def sample(self, observations: Batch, *, rng: np.random.Generator) -> Batch:
-        """Return actions drawn from each policy, leaves (P, n, ...)."""
-        return _stack([policy.sample(observations, rng=rng) for policy in self.policies])
+        """Return actions drawn from each policy, leaves (P, n, ...).
+
+        Each policy has a stream of its own, seeded by one draw from `rng`: what a policy draws depends on its place in
+        the set only, not on the policies before it, nor on what is stacked.
+        """
+        rngs = streams(rng, len(self))
+        return self._together(lambda numbers, stack: stack.sample(observations, rngs=[rngs[p] for p in numbers]))
 
     def mean(self, observations: Batch) -> Batch:
         """Return the mean actions of each policy, leaves (P, n, ...)."""
-        return _stack([policy.mean(observations) for policy in self.policies])
+        return self._together(lambda _, stack: stack.mean(observations))
 
     def log_prob(self, observations: Batch, actions: Batch) -> FloatArray:
         """Return log pi(a|s) of the same n actions under each policy, (P, n)."""
-        rows = [np.asarray(policy.log_prob(observations, actions), dtype=np.float64) for policy in self.policies]
-        return np.stack(rows)
+        return self._together(lambda _, stack: stack.log_prob(observations, actions))
 
     def probabilities(self, observations: Batch) -> FloatArray | None:
         """Return pi(a|s) of every discrete action, (P, n, K); None where a policy does not know them."""
@@ -107,8 +145,53 @@ class PolicySet:
             rows.append(np.asarray(policy.probabilities(observations), dtype=np.float64))
         return np.stack(rows)
 
+    @cached_property
+    def _groups(self) -> tuple[tuple[tuple[int, ...], PolicyStack], ...]:
+        """The policies (by number) that are evaluated together, and their computation."""
+        alike: dict[Hashable, list[int]] = {}
+        for number, policy in enumerate(self.policies):
+            stackable = isinstance(policy, StackablePolicy)
+            alike.setdefault((type(policy), policy.architecture) if stackable else number, []).append(number)
+        return tuple((tuple(numbers), _stacked([self.policies[p] for p in numbers])) for numbers in alike.values())
 
-def _stack(batches: list[Batch]) -> Batch:
+    def _together(self, evaluate: Callable[[tuple[int, ...], PolicyStack], Batch]) -> Batch:
+        """Evaluate every group and put the results in the policies' order."""
+        if len(self._groups) == 1:
+            return evaluate(*self._groups[0])
+        rows: dict[int, Batch] = {}
+        for numbers, stack in self._groups:
+            result = evaluate(numbers, stack)
+            rows |= {p: map_tree(lambda leaf, row=row: leaf[row], result) for row, p in enumerate(numbers)}
+        return _join([rows[p] for p in range(len(self))])
+
+
+@dataclass(frozen=True)
+class _Alone:
+    """One policy as a stack of one."""
+
+    policy: Policy
+
+    def sample(self, observations: Batch, *, rngs: Sequence[np.random.Generator]) -> Batch:
+        return _join([self.policy.sample(observations, rng=rngs[0])])
+
+    def log_prob(self, observations: Batch, actions: Batch) -> FloatArray:
+        return np.asarray(self.policy.log_prob(observations, actions), dtype=np.float64)[None]
+
+    def mean(self, observations: Batch) -> Batch:
+        return _join([self.policy.mean(observations)])
+
+
+def streams(rng: np.random.Generator, count: int) -> list[np.random.Generator]:
+    """Return the generators that the policies of a set draw from: the first ones are the same for any `count`."""
+    return [np.random.default_rng(int(seed)) for seed in rng.integers(0, 2**63 - 1, size=count)]
+
+
+def _stacked(policies: list[Policy]) -> PolicyStack:
+    alike = [policy for policy in policies if isinstance(policy, StackablePolicy)]
+    return type(alike[0]).stack(alike) if len(alike) > 1 else _Alone(policies[0])
+
+
+def _join(batches: list[Batch]) -> Batch:
     def join(*leaves: Any) -> npt.NDArray[Any]:
         return np.stack(leaves)
 

@@ -1,0 +1,311 @@
+"""ope.evaluate: one table for many policies, estimators and seeds, with honest errors, pairs and warnings."""
+
+import math
+import warnings
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import ClassVar
+
+import minari
+import numpy as np
+import pytest
+from gymnasium import spaces
+from minari import EpisodeData
+
+from oat_gym import AugmentedDataset, Function, ope
+from oat_gym.episodes import content_hash
+from oat_gym.errors import ConfigurationError, ConformanceError, EstimationWarning
+from oat_gym.ope import Estimates, Estimator, ImportanceSampling, Problem, evaluate
+from tests.conftest import install_dataset
+
+from . import mdps
+
+GAMMA = 0.9
+CHAIN = mdps.chain(3)
+BEHAVIOR = np.full((4, 2), 0.5)
+TABLES = {"left": np.tile([0.6, 0.4], (4, 1)), "same": BEHAVIOR, "right": np.tile([0.4, 0.6], (4, 1))}
+POLICIES = {name: mdps.Table(table) for name, table in TABLES.items()}
+KNOWN = mdps.Table(BEHAVIOR)
+IS = ImportanceSampling()
+
+
+def make(n: int = 60, *, seed: int = 0, length: int = 300, dataset_id: str = "test/chain-v0") -> minari.MinariDataset:
+    logs = mdps.sample_logs(CHAIN, BEHAVIOR, n, length, np.random.default_rng(seed))
+    return install_dataset(dataset_id, mdps.buffers(logs), spaces.Discrete(4), spaces.Discrete(2))
+
+
+@pytest.fixture
+def real() -> minari.MinariDataset:
+    return make()
+
+
+def louder(episode: EpisodeData, rng: np.random.Generator) -> EpisodeData:
+    episode.rewards[:] += 1.0
+    return episode
+
+
+def copied(episode: EpisodeData, rng: np.random.Generator) -> EpisodeData:
+    return episode
+
+
+@dataclass(frozen=True)
+class Fixed(Estimator):
+    """Gives what it was told to, with replicates around it; notes what it saw."""
+
+    value: float = 1.0
+    warning: str = ""
+    label: str = "fixed"
+    family: ClassVar[str] = "FQE"
+
+    @property
+    def name(self) -> str:
+        return self.label
+
+    def estimate(self, problem: Problem, *, seeds: tuple[int, ...]) -> tuple[Estimates, ...]:
+        if self.warning:
+            warnings.warn(self.warning, EstimationWarning, stacklevel=1)
+        policies, resamples = len(problem.policies), problem.resamples
+        noise = (resamples[:, 0] - 1.0) / 10
+        used = float(problem.episodes("training").sum())
+        return tuple(
+            Estimates(
+                np.full(policies, self.value + seed),
+                np.tile(self.value + seed + noise, (policies, 1)),
+                tuple({"episodes": used} for _ in range(policies)),
+            )
+            for seed in seeds
+        )
+
+
+def ask(data, estimators=IS, **settings):
+    defaults = {"gamma": GAMMA, "seeds": 1, "behavior": KNOWN, "resamples": 50}
+    return evaluate(data, POLICIES, estimators, **(defaults | settings))
+
+
+def test_rows_are_tidy_and_the_values_are_right(real: minari.MinariDataset) -> None:
+    forms = [
+        ImportanceSampling(kind=kind, weighted=w) for kind in ("trajectory", "per-decision") for w in (True, False)
+    ]
+    result = ask(real, forms, seeds=2, resamples=400)
+    assert [tuple(row) for row in result.rows] == [
+        ("policy", "estimator", "seed", "value", "standard_error", "low", "high", "diagnostics")
+    ] * (3 * 4 * 2)
+    returns = [(e.rewards * GAMMA ** np.arange(len(e.rewards))).sum() for e in real]
+    for row in result.rows:
+        assert row["low"] < row["value"] < row["high"]
+        truth = mdps.value(CHAIN, TABLES[row["policy"]], GAMMA)
+        assert abs(row["value"] - truth) < 4 * row["standard_error"]
+        if row["policy"] == "same":
+            assert row["value"] == pytest.approx(np.mean(returns))
+            assert row["standard_error"] == pytest.approx(np.std(returns) / math.sqrt(60), rel=0.15)
+
+
+def test_the_same_question_has_the_same_answer_and_seeds_and_policies_do_not_matter_to_each_other(
+    real: minari.MinariDataset,
+) -> None:
+    cloning = ope.BehaviorCloning(max_updates=20, folds=2, hidden=(8,))
+    both = ask(real, seeds=(3, 7), behavior=cloning)
+    alone = ask(real, seeds=(7,), behavior=cloning)
+    expected = [row for row in both.rows if row["seed"] == 7]
+    assert alone.rows == expected
+    assert expected != [row | {"seed": 7} for row in both.rows if row["seed"] == 3]
+    swapped = evaluate(
+        real, dict(reversed(POLICIES.items())), IS, gamma=GAMMA, seeds=(7,), behavior=cloning, resamples=50
+    )
+    by_name = {row["policy"]: row for row in swapped.rows}
+    for row in alone.rows:
+        assert by_name[row["policy"]]["value"] == pytest.approx(row["value"])
+    assert math.isfinite(alone.rows[0]["diagnostics"]["behavior_held_out_log_likelihood"])
+
+
+def test_the_data_and_the_global_random_states_are_left_alone(real: minari.MinariDataset) -> None:
+    before = content_hash(real)
+    state = np.random.get_state()[1].copy()  # noqa: NPY002
+    ask(real)
+    assert content_hash(real) == before
+    assert np.array_equal(np.random.get_state()[1], state)  # noqa: NPY002
+
+
+def test_copies_of_the_data_neither_move_the_value_nor_narrow_the_interval(real: minari.MinariDataset) -> None:
+    data = AugmentedDataset(real, Function(copied), factor=3, seed=0)
+    alone, copies = ask(real), ask(data, use_augmented="all")
+    for one, other in zip(alone.rows, copies.rows, strict=True):
+        for name in ("value", "standard_error", "low", "high"):
+            assert other[name] == pytest.approx(one[name], rel=1e-9)
+
+
+def test_use_augmented_says_who_sees_synthetic_episodes(real: minari.MinariDataset) -> None:
+    data = AugmentedDataset(real, Function(louder), count=40, seed=0)
+    trained = Fixed(label="trained")
+
+    def seen(use_augmented) -> tuple[float, bool]:
+        rows = ask(data, [trained, IS], use_augmented=use_augmented, seeds=1).rows
+        return rows[0]["diagnostics"]["episodes"], rows[-1]["value"] != pytest.approx(reference)
+
+    reference = ask(real).rows[-1]["value"]
+    assert seen("all") == (100.0, True)
+    assert seen(None) == (100.0, False)
+    assert seen("none") == (60.0, False)
+    assert seen(("weights",))[0] == 60.0
+    assert seen({"IS": "none"}) == (100.0, False)
+    assert seen({"trained": "none"}) == (60.0, False)
+    assert seen({"FQE": ("initial",), "IS": ("weights",)}) == (60.0, True)
+
+
+def test_a_paired_evaluation_has_the_difference_with_its_interval(real: minari.MinariDataset) -> None:
+    # every copy earns one more each step: the mean over 60 real and 60 louder ones is known
+    data = AugmentedDataset(real, Function(louder), count=60, seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EstimationWarning)
+        result = ask(data, paired=True, use_augmented="all", resamples=400)
+        unpaired = ask(real, resamples=400)
+    assert [row["data"] for row in result.rows] == ["augmented"] * 3 + ["real"] * 3
+    for row, alone in zip(result.rows[3:], unpaired.rows, strict=True):
+        assert row["value"] == pytest.approx(alone["value"])
+        assert row["low"] == pytest.approx(alone["low"])
+    lengths = np.array([len(episode.rewards) for episode in real])
+    extra = ((1 - GAMMA**lengths) / (1 - GAMMA)) / 2
+    change = next(row for row in result.differences if row["policy"] == "same")
+    assert change["difference"] == pytest.approx(extra.mean())
+    assert change["standard_error"] == pytest.approx(extra.std() / math.sqrt(60), rel=0.15)
+    assert change["low"] < extra.mean() < change["high"]
+    with pytest.raises(ConfigurationError, match="Only a paired evaluation"):
+        _ = unpaired.differences
+    with pytest.raises(ConfigurationError, match="there are none"):
+        ask(real, paired=True)
+
+
+def test_over_seeds_adds_the_spread_of_the_seeds_to_the_error_of_the_data(real: minari.MinariDataset) -> None:
+    result = ask(real, Fixed(value=-1.0), seeds=(0, 1, 2), resamples=400)
+    average = result.over_seeds()[0]
+    assert (average["seeds"], average["value"], average["seed_spread"]) == (3, pytest.approx(0.0), pytest.approx(1.0))
+    data_error = result.rows[0]["standard_error"]
+    assert average["standard_error"] == pytest.approx(math.hypot(data_error, 1 / math.sqrt(3)))
+    assert average["high"] - average["low"] > 2 * 4.3 / math.sqrt(3)
+    single = ask(real, Fixed(), seeds=1, resamples=400)
+    assert single.over_seeds()[0]["low"] == single.rows[0]["low"]
+
+
+def test_compare_and_t_test(real: minari.MinariDataset) -> None:
+    truth = {name: mdps.value(CHAIN, table, GAMMA) for name, table in TABLES.items()}
+    result = ask(real, resamples=400)
+    for given in (truth, SimpleNamespace(values=truth, gamma=GAMMA)):
+        row = result.compare(given)[0]
+        assert row["mae"] == pytest.approx(np.mean([abs(r["value"] - truth[r["policy"]]) for r in result.rows]))
+    with pytest.raises(ConfigurationError, match=r"truth is of gamma=0\.5"):
+        result.compare(SimpleNamespace(values=truth, gamma=0.5))
+    with pytest.raises(ConfigurationError, match="truth must map policies"):
+        result.compare(3.0)
+    tests = {row["policy"]: row for row in result.t_test("same")}
+    assert set(tests) == {"left", "right"}
+    direct = ope.metrics.t_test(result.replicates("left", IS.name, 0), result.replicates("same", IS.name, 0), n=60)
+    assert tests["left"]["p_value"] == direct.p_value
+    with pytest.raises(ConfigurationError, match="baseline must be one of"):
+        result.t_test("expert")
+    with pytest.raises(ConfigurationError, match="There is no row"):
+        result.replicates("left", "IS", 0)
+
+
+def test_tables_for_people_and_for_pandas(real: minari.MinariDataset) -> None:
+    result = ask(real)
+    lines = str(result).splitlines()
+    assert lines[0].split() == ["policy", "estimator", "seed", "value", "standard_error", "low", "high"]
+    assert len(lines) == 4
+    frame = result.to_frame()
+    assert list(frame["policy"]) == list(POLICIES)
+    assert (frame["diagnostics.effective_sample_size"] > 10).all()
+
+
+def test_warnings_reach_the_user_and_the_rows(real: minari.MinariDataset) -> None:
+    with pytest.warns(EstimationWarning, match="did not settle"):
+        result = ask(real, [Fixed(warning="it did not settle"), IS])
+    assert result.rows[0]["diagnostics"]["warnings"] == ("it did not settle",)
+    assert result.rows[-1]["diagnostics"]["warnings"] == ()
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [(1e23, r"beyond what the rewards allow \(-1 to 10\), such as 1e\+23"), (math.nan, "not finite")],
+)
+def test_values_that_no_reward_can_give_are_told(real: minari.MinariDataset, value: float, message: str) -> None:
+    with pytest.warns(EstimationWarning, match=message):
+        result = ask(real, Fixed(value=value))
+    assert len(result.rows[0]["diagnostics"]["warnings"]) == 1
+
+
+def test_horizons_count_so_many_steps(real: minari.MinariDataset) -> None:
+    same = [row for row in ask(real, horizon=2, gamma=1.0).rows if row["policy"] == "same"]
+    assert same[0]["value"] == pytest.approx(np.mean([episode.rewards[:2].sum() for episode in real]))
+    terminating = [row for row in ask(real, gamma=1.0).rows if row["policy"] == "same"]
+    assert terminating[0]["value"] == pytest.approx(np.mean([episode.rewards.sum() for episode in real]))
+
+
+def test_logged_propensities_are_the_known_policy() -> None:
+    logs = mdps.sample_logs(CHAIN, BEHAVIOR, 30, 200, np.random.default_rng(0))
+    buffers = [
+        replace(buffer, infos={"log_prob": np.full((len(buffer.rewards) + 1, 1), math.log(0.5))})
+        for buffer in mdps.buffers(logs)
+    ]
+    data = install_dataset("test/logged-v0", buffers, spaces.Discrete(4), spaces.Discrete(2))
+    logged, known = ask(data, behavior="logged"), ask(data)
+    assert [row["value"] for row in logged.rows] == pytest.approx([row["value"] for row in known.rows])
+
+
+def test_ids_lists_and_single_policies_are_taken(real: minari.MinariDataset) -> None:
+    by_id = evaluate("test/chain-v0", KNOWN, IS, gamma=GAMMA, seeds=1, behavior=KNOWN, resamples=20)
+    assert [row["policy"] for row in by_id.rows] == ["policy-0"]
+    pair = evaluate(real, [KNOWN, KNOWN], [IS], gamma=GAMMA, seeds=[5], behavior=KNOWN, resamples=20)
+    assert [(row["policy"], row["seed"]) for row in pair.rows] == [("policy-0", 5), ("policy-1", 5)]
+
+
+def test_given_initial_states_are_handed_on(real: minari.MinariDataset) -> None:
+    with pytest.warns(EstimationWarning, match="not from those given as initial_states"):
+        ask(real, initial_states=np.array([0, 1, 1]))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"gamma": 0.0}, "gamma must be above 0 and at most 1, got 0.0"),
+        ({"gamma": 1.5}, "gamma must be above 0"),
+        ({"horizon": 0}, "horizon must be a number of steps"),
+        ({"horizon": 2.5}, "horizon must be a number of steps"),
+        ({"seeds": 0}, "positive number of seeds"),
+        ({"seeds": (1, 1)}, "different seeds"),
+        ({"seeds": (-1,)}, "non-negative integer"),
+        ({"behavior": "cloned"}, "'clone', 'logged'"),
+        ({"behavior": lambda s: s}, "'clone', 'logged'"),
+        ({"use_augmented": "some"}, "use_augmented must be None, 'all'"),
+        ({"use_augmented": ("test",)}, "a tuple out of behavior, initial, training, weights"),
+        ({"use_augmented": {"FQE": "all"}}, "use_augmented names FQE"),
+        ({"interval": "bca"}, "interval must be one of bootstrap, percentile, normal"),
+        ({"confidence": 95}, "confidence must lie between 0 and 1"),
+        ({"resamples": 1}, "resamples must be a whole number"),
+        ({"initial_states": np.zeros((3, 2))}, r"shape \(M, \).*got shape \(3, 2\)"),
+        ({"initial_states": np.array(1)}, "A single state needs one more axis"),
+        ({"initial_states": np.zeros(0)}, "at least one observation"),
+        ({"estimators": []}, "at least one"),
+        ({"estimators": ImportanceSampling}, "instances such as"),
+        ({"estimators": [IS, IS]}, "IS per-decision weighted is there more than once"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(real: minari.MinariDataset, settings: dict, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        ask(real, **settings)
+
+
+def test_undiscounted_values_need_an_end() -> None:
+    cut = make(12, length=2, dataset_id="test/cut-v0")
+    with pytest.raises(ConfigurationError, match="gamma=1 without a horizon has no finite value here"):
+        ask(cut, gamma=1.0)
+    with pytest.raises(ConfigurationError, match="data must be a Minari dataset"):
+        ask(3)
+
+
+def test_an_estimator_of_wrong_shapes_is_named(real: minari.MinariDataset) -> None:
+    class Wrong(Fixed):
+        def estimate(self, problem: Problem, *, seeds: tuple[int, ...]) -> tuple[Estimates, ...]:
+            return (Estimates(np.zeros(2), np.zeros((2, 3)), ({}, {})),) * len(seeds)
+
+    with pytest.raises(ConformanceError, match="fixed returned values, replicates and diagnostics of shapes"):
+        ask(real, Wrong())
