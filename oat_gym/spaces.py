@@ -65,10 +65,10 @@ class FlatSpace:
 
     >>> flat = FlatSpace.of(spaces.Dict(speed=spaces.Box(-1, 1, (2,)), gear=spaces.Discrete(3)))
     >>> flat.layout
-    Layout(width=5, continuous=(0, 1), categorical=((2, 5),))
+    Layout(width=5, continuous=(3, 4), categorical=((0, 3),))
     >>> matrix = flat.flatten({"gear": np.array([2]), "speed": np.array([[0.5, -1.0]], dtype=np.float32)})
     >>> matrix.tolist()
-    [[0.5, -1.0, 0.0, 0.0, 1.0]]
+    [[0.0, 0.0, 1.0, 0.5, -1.0]]
     >>> flat.unflatten(matrix)["gear"].tolist()
     [2]
     """
@@ -141,10 +141,13 @@ class FlatSpace:
 def iter_leaf_spaces(
     space: spaces.Space[Any], path: tuple[str | int, ...] = ()
 ) -> Iterator[tuple[tuple[str | int, ...], spaces.Space[Any]]]:
-    """Yield (path, space) of every space inside `space` that is neither Dict nor Tuple, in storage order."""
+    """Yield (path, space) of every space inside `space` that is neither Dict nor Tuple, keys in alphabetical order.
+
+    The order of a Dict's keys is no part of it: in memory it may be another than after reading the space from disk.
+    """
     if isinstance(space, spaces.Dict):
-        for key, child in space.spaces.items():
-            yield from iter_leaf_spaces(child, (*path, key))
+        for key in sorted(space.spaces):
+            yield from iter_leaf_spaces(space.spaces[key], (*path, key))
     elif isinstance(space, spaces.Tuple):
         for index, child in enumerate(space.spaces):
             yield from iter_leaf_spaces(child, (*path, index))

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from gymnasium import Space
 
 from oat_gym._rng import check_seed
 from oat_gym.augmenters.base import Augmenter, Sampler, Variation
@@ -16,6 +17,7 @@ from oat_gym.episodes import IntArray
 from oat_gym.errors import ConfigurationError
 from oat_gym.progress import ProgressCallback, progress_bar
 from oat_gym.source import Source
+from oat_gym.spaces import iter_leaf_spaces
 
 MAX_COUNT = 10_000_000
 """Most synthetic episodes of one dataset: a plan keeps a length for each, and a recipe may ask for anything."""
@@ -127,10 +129,15 @@ class Synthesis:
         """Fingerprint of the source's content and spaces, the augmenter's configuration, and the seed."""
         return fingerprint(
             source=self.source.fingerprint,
-            spaces=[repr(self.source.observation_space), repr(self.source.action_space)],
+            spaces=[_leaves(self.source.observation_space), _leaves(self.source.action_space)],
             augmenter=[self.augmenter.name, canonical(self.augmenter)],
             seed=self.seed,
         )
+
+
+def _leaves(space: Space[Any]) -> list[list[str]]:
+    """Return what identifies a space, whatever the order in which a Dict lists its keys."""
+    return [[repr(path), repr(leaf)] for path, leaf in iter_leaf_spaces(space)]
 
 
 def _told(description: str, numbers: range, progress: ProgressCallback) -> Iterator[int]:

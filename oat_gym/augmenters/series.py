@@ -9,7 +9,7 @@ method adds is added to the recorded values, so that what it leaves alone stays 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from minari import EpisodeData
 from oat_gym.episodes import BoolArray, IntArray
 from oat_gym.errors import ConfigurationError, InvalidDataError
 from oat_gym.source import Source
-from oat_gym.spaces import Batch, FlatSpace, FloatMatrix, Layout, Leaf, get_leaf, map_tree
+from oat_gym.spaces import Batch, FlatSpace, FloatMatrix, Layout, get_leaf, map_tree
 
 _CONSTANT = 1e-10  # a column whose spread is below this share of its size is constant up to rounding
 _KEPT_SERIES = 512
@@ -69,7 +69,7 @@ class Series:
 
     def __init__(self, source: Source) -> None:
         self.source = source
-        self._flats = _in_key_order(source.flat_observations), _in_key_order(source.flat_actions)
+        self._flats = source.flat_observations, source.flat_actions
         self.layouts = self._flats[0].layout, self._flats[1].layout, _REWARD
         everything = [self.columns(i) for i in range(len(source))]
         parts = zip(*((one.states, one.actions, one.rewards) for one in everything), strict=True)
@@ -242,18 +242,6 @@ def _altered(flat: FlatSpace, batch: Batch, old: FloatMatrix, new: FloatMatrix) 
         where = np.True_ if leaf.sizes else keep.reshape(target.shape)
         np.copyto(target, recorded, where=where, casting="unsafe")
     return made
-
-
-def _in_key_order(flat: FlatSpace) -> FlatSpace:
-    """Return the flattening with its columns in the order of the keys.
-
-    A Dict in memory and the same one read from a file may list their keys in another order: columns in an order of
-    their own get the same random numbers in both.
-    """
-    leaves: list[Leaf] = []
-    for leaf in sorted(flat.leaves, key=lambda leaf: [str(key) for key in leaf.path]):
-        leaves.append(replace(leaf, start=leaves[-1].start + leaves[-1].width if leaves else 0))
-    return replace(flat, leaves=tuple(leaves))
 
 
 def _in_dtype_of(recorded: npt.NDArray[Any], made: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -37,7 +37,7 @@ class TimeGAN(Augmenter):
 
     A synthetic episode has the length, the flags and the infos of its source episode and is its source in nothing else.
 
-    The default trains 600, 300 and 250 iterations at rate 3e-3 on 16 whole episodes at a time: minutes on a CPU for
+    The default trains 600, 300 and 200 iterations at rate 3e-3 on 16 whole episodes at a time: minutes on a CPU for
     tens of episodes of hundreds of steps. That is far less than the original's 50,000 a phase at 1e-3 on 128 series of
     24 steps, which `TimeGAN.preset("paper")` runs: hours, and days with long episodes. Judge what it made before use.
 

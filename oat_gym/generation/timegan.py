@@ -47,7 +47,7 @@ class TimeGANConfig:
     layers: int = 3
     embedding_iterations: int = 600
     supervised_iterations: int = 300
-    joint_iterations: int = 250
+    joint_iterations: int = 200
     batch_size: int = 16
     learning_rate: float = 3e-3
     gamma: float = 1.0
@@ -65,7 +65,7 @@ class TimeGANConfig:
 
     @classmethod
     def from_preset(cls, preset: str) -> TimeGANConfig:
-        """Return a named configuration: "default", or "paper" (50,000 iterations a phase, minibatches of 128, rate 1e-3).
+        """Return a named configuration: "default", or "paper" (50,000 iterations a phase, batches of 128, rate 1e-3).
 
         Raises:
             ConfigurationError: for any other name.
