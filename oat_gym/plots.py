@@ -1,4 +1,4 @@
-"""Pictures: trajectories in a maze, the paper's Figure 4, and the support curve.
+"""Pictures: trajectories in a maze, the paper's Figure 4, the support curve, and the fidelity of methods.
 
 Every function takes plain arrays and returns a `matplotlib.figure.Figure` that belongs to nobody else: pyplot and its
 global state are not used, so no window opens and no back end is chosen. Matplotlib is imported when a picture is drawn.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -196,6 +197,118 @@ def support_curve(
     axes.spines[["top", "right"]].set_visible(False)
     _legend_below(figure, *axes.get_legend_handles_labels())
     return _finish(figure, path)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One panel of `fidelity`: a title, what is on its axis, a value for each method, and the value of real data.
+
+    None in `values` is a method without this value; where `references` is None, or empty, no line is drawn. `limits`
+    are the least and the largest possible value, where there are such: they are the ends of the axis.
+    """
+
+    title: str
+    label: str
+    values: Sequence[float | None]
+    references: Sequence[float | None] = ()
+    limits: tuple[float, float] | None = None
+
+
+def fidelity(
+    methods: Sequence[str],
+    panels: Sequence[Panel],
+    *,
+    title: str | None = None,
+    path: Path | None = None,
+) -> Figure:
+    """Return small multiples that compare methods: one panel a metric, one row a method, a line where real data lies.
+
+    Each value is a dot, joined to the line of its real data; a method without a value shows "none". An axis without
+    limits is logarithmic where all its values are positive and the largest is over 20 times the smallest.
+
+    Args:
+        methods: names, from top to bottom.
+        panels: the metrics, from left to right and then down; those without any value are left out.
+        title: over the figure.
+        path: where to save the figure as well.
+
+    Raises:
+        InvalidDataError: for no methods, no panel with a value, or a panel with another number of values.
+
+    >>> figure = fidelity(["copy", "noise"], [Panel("MMD", "squared", [0.0, 0.2], [0.01, 0.01])])
+    >>> figure.axes[0].get_title(loc="left")
+    'MMD'
+    """
+    for panel in panels:
+        counts = len(panel.values), len(panel.references)
+        if counts[0] != len(methods) or counts[1] not in (0, len(methods)):
+            raise InvalidDataError(
+                f"The panel {panel.title!r} has {counts[0]} values, {counts[1]} references; expected {len(methods)}, "
+                "one a method (references may be left out)."
+            )
+    shown = [panel for panel in panels if any(value is not None for value in panel.values)]
+    if not shown:
+        raise InvalidDataError("There is nothing to draw: no method has a value in any panel.")
+    columns = min(5, len(shown))
+    rows = -(-len(shown) // columns)
+    figure = _figure(1.4 + 1.75 * columns, 0.7 + rows * (0.75 + 0.19 * len(methods)))
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    for axes, panel in zip(grid.flat, shown, strict=False):
+        _draw_panel(axes, panel)
+    for axes in grid.flat[len(shown) :]:
+        axes.set_visible(False)
+    for axes in grid[:, 0]:
+        axes.set_yticks(range(len(methods)), methods)
+        axes.set_ylim(len(methods) - 0.4, -0.6)
+    if title is not None:
+        figure.suptitle(title, fontsize=_TEXT + 2)
+    _legend_below(figure, *_fidelity_handles())
+    return _finish(figure, path)
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    from matplotlib.ticker import FixedLocator, LogFormatterSciNotation, MaxNLocator, NullFormatter
+
+    references = list(panel.references) or [None] * len(panel.values)
+    known = [(row, value, references[row]) for row, value in enumerate(panel.values) if value is not None]
+    levels = np.array([number for _, *pair in known for number in pair if number is not None], dtype=np.float64)
+    low, high = panel.limits or (min(0.0, float(levels.min())), max(float(levels.max()), 1e-12))
+    if panel.limits is None and levels.min() > 0 and levels.max() > 20 * levels.min():
+        low = float(levels.min())
+        axes.set_xscale("log")
+        axes.margins(x=0.15)
+        axes.xaxis.set_major_formatter(LogFormatterSciNotation())
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    else:
+        axes.set_xlim(low - 0.06 * (high - low), high + 0.1 * (high - low))
+        axes.xaxis.set_major_locator(FixedLocator([low, (low + high) / 2, high]) if panel.limits else MaxNLocator(3))
+    for row, value, reference in known:
+        if reference is not None:
+            axes.vlines(reference, row - 0.5, row + 0.5, color=SET_COLORS[1], linewidth=1.2, zorder=1)
+        axes.hlines(row, low if reference is None else reference, value, color=REST_COLOR, linewidth=1.0, zorder=2)
+        axes.plot([value], [row], "o", color=SET_COLORS[0], markersize=4, zorder=3)
+    for row, value in enumerate(panel.values):
+        if value is None:
+            where = axes.get_yaxis_transform()
+            axes.text(0.5, row, "none", transform=where, ha="center", va="center", fontsize=_TEXT - 2, color=REST_COLOR)
+    _style_panel(axes, panel)
+
+
+def _style_panel(axes: Axes, panel: Panel) -> None:
+    axes.set_title(panel.title, fontsize=_TEXT + 1, loc="left")
+    axes.set_xlabel(panel.label, fontsize=_TEXT - 1)
+    axes.tick_params(labelsize=_TEXT - 1, length=2.5)
+    axes.tick_params(axis="y", labelsize=_TEXT, length=0)
+    axes.grid(axis="y", color=WALL_COLOR, linewidth=0.4)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+
+
+def _fidelity_handles() -> tuple[list[Any], list[str]]:
+    from matplotlib.lines import Line2D
+
+    dot = Line2D([], [], color=SET_COLORS[0], marker="o", markersize=4, linewidth=0)
+    return [dot, Line2D([], [], color=SET_COLORS[1], linewidth=1)], ["method", "real data in its place"]
 
 
 def _path(number: int, rows: Positions) -> npt.NDArray[np.float64]:

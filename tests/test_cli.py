@@ -1,5 +1,6 @@
-"""The command line as its user meets it: in a process of its own, in an empty folder."""
+"""The command line as its user meets it, in an empty folder."""
 
+import csv
 import dataclasses
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import minari
 import pytest
 from typer.testing import CliRunner
 
-from oat_gym import OAT, AugmentedDataset, cli
+from oat_gym import AUGMENTERS, OAT, AugmentedDataset, MiningConfig, cli, metrics
 from oat_gym.errors import AugmentationWarning
 from oat_gym.generation import BehaviorConfig, VAEMDPConfig
 
@@ -20,7 +21,7 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("command", [[], ["demo"], ["augment"], ["inspect"], ["cache"], ["cache", "list"]])
+@pytest.mark.parametrize("command", [[], ["demo"], ["augment"], ["inspect"], ["compare"], ["cache"], ["cache", "list"]])
 def test_help(command: list[str]) -> None:
     result = CliRunner().invoke(cli.app, [*command, "--help"])
     assert result.exit_code == 0
@@ -40,18 +41,52 @@ def test_help(command: list[str]) -> None:
         (["augment", "maze2d-umaze", "--top", "0"], "top must be"),
         (["augment", "maze2d-umaze", "--factor", "ten"], "Invalid value for '--factor'"),
         (["augment", "maze2d-umaze", "--length", "\u00b2"], "--length"),
+        (["augment", "maze2d-umaze", "--augmenter", "jittering", "--length", "20"], "only of oat, tda: leave it out"),
+        (["augment", "maze2d-umaze", "--augmenter", "tda", "--top", "2"], "only of oat: leave it out"),
+        (["augment", "maze2d-umaze", "--augmenter", "tda", "--length", "auto"], "length must be"),
+        (["augment", "maze2d-umaze", "--augmenter", "tda", "--length", "1000"], "No episode is as long"),
         (["augment"], "Missing argument"),
+        (["compare", "nowhere/none-v0"], "minari download nowhere/none-v0"),
+        (["compare", "maze2d-umaze", "--augmenters", "oat,magic"], "no augmenter 'magic'"),
+        (["compare", "maze2d-umaze", "--augmenters", "tda,oat,tda"], "names a method twice"),
+        (["compare", "maze2d-umaze", "--factor", "1"], "--factor must be more than 1"),
         (["magic"], "No such command"),
         (["demo", "--factor", "1"], "--factor must be more than 1"),
     ],
 )
-def test_bad_input_is_one_line_and_status_2(arguments: list[str], message: str, tmp_path: Path) -> None:
+def test_bad_input_is_one_line_and_status_2(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["oat-gym", *arguments])
+    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)  # main replaces it
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    check_complaint(stop.value.code, capsys.readouterr().err, message, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["augment", "nowhere/none-v0"], "minari download nowhere/none-v0"),
+        (["compare", "maze2d-umaze", "--augmenters", "oat,magic"], "no augmenter 'magic'"),
+    ],
+)
+def test_bad_input_in_a_process_of_its_own(arguments: list[str], message: str, tmp_path: Path) -> None:
     result = run(*arguments, folder=tmp_path)
-    assert result.returncode == 2
-    assert message in result.stderr
-    assert result.stderr.count("\n") == 1
-    assert "Traceback" not in result.stderr
-    assert list(tmp_path.iterdir()) == []
+    check_complaint(result.returncode, result.stderr, message, tmp_path)
+
+
+def check_complaint(status: object, errors: str, message: str, folder: Path) -> None:
+    assert status == 2
+    assert message in errors
+    assert errors.count("\n") == 1
+    assert "Traceback" not in errors
+    assert list(folder.iterdir()) == []
 
 
 def test_inspect_shows_a_plain_and_an_augmented_dataset(
@@ -70,7 +105,7 @@ def test_inspect_shows_a_plain_and_an_augmented_dataset(
 def test_augment_saves_what_the_library_makes(
     walk_dataset: minari.MinariDataset, monkeypatch: pytest.MonkeyPatch, tiny_oat: OAT
 ) -> None:
-    monkeypatch.setattr(cli, "_configure", lambda name, length, top: tiny_oat)
+    monkeypatch.setattr(cli.augment, "configure", lambda name, *, length, top: tiny_oat)
     result = CliRunner().invoke(cli.app, ["augment", "test/walks-v0", "--factor", "3", "--seed", "4"])
     assert result.exit_code == 0, result.output
     saved = minari.load_dataset("test/walks-oat-v0")
@@ -78,10 +113,74 @@ def test_augment_saves_what_the_library_makes(
     assert all((a.rewards == b.rewards).all() for a, b in zip(saved, expected, strict=True))
 
 
+@pytest.mark.parametrize("name", [name for name, kind in AUGMENTERS.items() if not kind.trains])
+def test_augment_takes_every_method(name: str, walk_dataset: minari.MinariDataset) -> None:
+    """Those that train are tested with small settings in their own folder."""
+    result = CliRunner().invoke(cli.app, ["augment", "test/walks-v0", "--augmenter", name, "--factor", "2"])
+    assert result.exit_code == 0, result.output
+    assert f"test/walks-{name}-v0: 12 real + 12 synthetic" in result.output
+    saved = minari.load_dataset(f"test/walks-{name}-v0")
+    expected = AugmentedDataset(walk_dataset, AUGMENTERS[name](), factor=2)
+    assert all((a.rewards == b.rewards).all() for a, b in zip(saved, expected, strict=True))
+
+
+def test_length_and_top_reach_the_methods_that_have_them() -> None:
+    assert cli.configure("oat", length="7", top=3) == OAT(mining=MiningConfig(n_clusters="auto", length=7, top=3))
+    assert cli.configure("oat", length="auto").mining.length == "auto"  # type: ignore[attr-defined]
+    assert cli.configure("tda", length="7").length == 7  # type: ignore[attr-defined]
+    assert all(cli.configure(name) == kind() for name, kind in AUGMENTERS.items())
+
+
+def test_compare_prints_a_table_and_writes_it_with_a_picture(
+    walk_dataset: minari.MinariDataset, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    methods = {"jittering": AUGMENTERS["jittering"], "long": lambda: AUGMENTERS["tda"](length=1000)}  # type: ignore[call-arg]
+    monkeypatch.setattr("oat_gym.cli.compare.AUGMENTERS", methods)
+    monkeypatch.setattr("oat_gym.cli._shared.AUGMENTERS", methods)
+    folder = tmp_path / "made" / "here"
+    arguments = ["compare", "test/walks-v0", "--factor", "2", "--out", str(folder)]
+    result = CliRunner().invoke(cli.app, arguments)
+    assert result.exit_code == 0, result.output
+    assert {path.name for path in folder.iterdir()} == {"walks-v0.csv", "walks-v0.png"}
+    assert (folder / "walks-v0.png").read_bytes().startswith(b"\x89PNG")
+    rows = list(csv.DictReader((folder / "walks-v0.csv").read_text().splitlines()))
+    assert [row["augmenter"] for row in rows] == ["jittering", "long"]
+    found = metrics.fidelity(AugmentedDataset(walk_dataset, AUGMENTERS["jittering"](), factor=2))
+    for name, value in found.to_row().items():
+        cell = rows[0][name]
+        assert cell == "" if value is None else float(cell) == pytest.approx(value, rel=1e-5, abs=1e-12), name
+    assert rows[0]["reason"] == ""
+    assert "No episode is as long" in rows[1]["reason"]
+    assert rows[1]["marginal"] == ""
+    assert "No episode is as long" in result.output
+    lines = result.output.splitlines()
+    assert max(map(len, lines[1:-6])) <= 80
+    shown = [line.split()[1:] for line in lines if line.strip().startswith("jittering")]
+    expected = [found.score(name).value for name in metrics.METRICS]
+    assert [cell for cells in shown for cell in cells] == [
+        "-" if value is None else f"{value:.3g}" for value in expected
+    ]
+    first = (folder / "walks-v0.csv").read_bytes()
+    assert CliRunner().invoke(cli.app, arguments).exit_code == 0
+    assert (folder / "walks-v0.csv").read_bytes() == first
+
+
+def test_compare_where_no_method_can_work(
+    walk_dataset: minari.MinariDataset, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    methods = {"long": lambda: AUGMENTERS["tda"](length=1000)}  # type: ignore[call-arg]
+    monkeypatch.setattr("oat_gym.cli.compare.AUGMENTERS", methods)
+    monkeypatch.setattr("oat_gym.cli._shared.AUGMENTERS", methods)
+    result = CliRunner().invoke(cli.app, ["compare", "test/walks-v0", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    assert "long: No episode is as long" in result.output
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["walks-v0.csv"]
+
+
 def test_demo_writes_one_folder_and_runs_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"model": VAEMDPConfig(max_updates=5), "behavior": BehaviorConfig(max_updates=20)}
-    mining = dataclasses.replace(cli.DEMO_CONFIG.mining, n_clusters=4, init="kmeans")
-    monkeypatch.setattr(cli, "DEMO_CONFIG", dataclasses.replace(cli.DEMO_CONFIG, mining=mining, **small))
+    mining = dataclasses.replace(cli.demo.DEMO_CONFIG.mining, n_clusters=4, init="kmeans")
+    monkeypatch.setattr(cli.demo, "DEMO_CONFIG", dataclasses.replace(cli.demo.DEMO_CONFIG, mining=mining, **small))
     monkeypatch.chdir(tmp_path)
     warnings.simplefilter("ignore", AugmentationWarning)  # short episodes hold no PST
     for _ in range(2):

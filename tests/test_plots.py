@@ -92,6 +92,37 @@ def test_maze_figure_marks_starts_and_ends(tmp_path):
     assert (tmp_path / "maze.png").exists()
 
 
+def test_fidelity_has_a_panel_a_metric_a_dot_a_method_and_a_line_where_real_data_lies(tmp_path):
+    panels = [
+        plots.Panel("share", "share", [0.2, None, 0.9], [0.5, 0.5, 0.4], limits=(0, 1)),
+        plots.Panel("nothing", "sd", [None, None, None]),
+        plots.Panel("ratio", "ratio", [0.1, 1.0, 50.0], [1.0, 1.0, None]),
+        plots.Panel("difference", "sd", [-0.1, 0.0, 0.3]),
+    ]
+    figure = plots.fidelity(["a", "b", "c"], panels, title="methods", path=tmp_path / "fidelity.png")
+    share, ratio, difference = [axes for axes in figure.axes if axes.get_visible()]
+    dots = [(line.get_xdata()[0], line.get_ydata()[0]) for line in share.get_lines()]
+    assert dots == [(0.2, 0), (0.9, 2)]
+    assert [text.get_text() for text in share.texts] == ["none"]
+    upright = [item.get_segments()[0] for item in lines(share) if np.ptp(item.get_segments()[0][:, 0]) == 0]
+    np.testing.assert_allclose([segment[0, 0] for segment in upright], [0.5, 0.4])
+    np.testing.assert_allclose(share.get_xticks(), [0, 0.5, 1])
+    assert (share.get_xscale(), ratio.get_xscale(), difference.get_xscale()) == ("linear", "log", "linear")
+    assert [label.get_text() for label in share.get_yticklabels()] == ["a", "b", "c"]
+    assert share.get_ylim()[0] > share.get_ylim()[1]  # the first method is on top
+    assert difference.get_xlim()[0] < -0.1
+    assert (tmp_path / "fidelity.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_fidelity_refuses_other_numbers_of_values_and_nothing_to_draw():
+    with pytest.raises(InvalidDataError, match="'MMD' has 1 values, 0 references; expected 2"):
+        plots.fidelity(["a", "b"], [plots.Panel("MMD", "squared", [0.1])])
+    with pytest.raises(InvalidDataError, match="has 2 values, 1 references"):
+        plots.fidelity(["a", "b"], [plots.Panel("MMD", "squared", [0.1, 0.2], [0.3])])
+    with pytest.raises(InvalidDataError, match="nothing to draw"):
+        plots.fidelity(["a"], [plots.Panel("MMD", "squared", [None])])
+
+
 @pytest.mark.parametrize("span", [(3, 0, 1), (-1, 0, 1), (0, 2, 2), (0, -1, 2), (0, 3, 5)])
 def test_spans_outside_their_episode_are_refused(span):
     with pytest.raises(InvalidDataError, match="Set 1 has the span"):
