@@ -127,7 +127,7 @@ def with_copies(data: Logged, copies: int, *, extra_reward: float = 0.0) -> Logg
 def pose(
     data: Logged, names: tuple[str, ...] = tuple(TARGETS), *, horizon: int | None = None, everywhere: bool = False
 ) -> Problem:
-    """Return the problem of evaluating the named policies on the data; `everywhere`: synthetic episodes in all parts."""
+    """Return the problem of evaluating the named policies; `everywhere`: synthetic episodes in all parts."""
     steps = data.steps
     log_beta = BEHAVIOR.log_prob(steps.observations, steps.actions)
     used = np.ones(len(data), dtype=bool) if everywhere else ~data.synthetic

@@ -59,10 +59,8 @@ class SharedStream(Sound):
 
     def estimate(self, problem: Problem, *, seeds: tuple[int, ...]) -> tuple[Estimates, ...]:
         rng = np.random.default_rng(seeds[0])
-        return tuple(
-            changed((each,), values=lambda v, noise=rng.normal(): v + 0.02 * noise)[0]
-            for each in super().estimate(problem, seeds=seeds)
-        )
+        found = super().estimate(problem, seeds=seeds)
+        return tuple(replace(each, values=each.values + 0.02 * rng.normal()) for each in found)
 
 
 @dataclass(frozen=True)
