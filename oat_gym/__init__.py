@@ -10,7 +10,7 @@ Importing the package teaches Minari the data format "oat" (see `oat_gym.dataset
 
 import importlib.metadata
 
-from oat_gym import checks, domains, mining, ope
+from oat_gym import checks, domains, metrics, mining, ope
 from oat_gym.augmenters import AUGMENTERS, Augmenter, Function
 from oat_gym.augmenters.compose import Compose
 from oat_gym.augmenters.dgw import DGW
@@ -65,6 +65,7 @@ __all__ = [
     "augment",
     "checks",
     "domains",
+    "metrics",
     "mining",
     "ope",
     "read_d4rl",

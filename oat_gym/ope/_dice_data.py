@@ -84,7 +84,9 @@ class Side:
 class DiceBatches:
     """Draws minibatches; every seed has its own stream, and a minibatch is the same for all policies of a seed."""
 
-    def __init__(self, problem: Problem, encoder: Encoder, *, size: int, action_draws: int, seeds: Sequence[int]) -> None:
+    def __init__(
+        self, problem: Problem, encoder: Encoder, *, size: int, action_draws: int, seeds: Sequence[int]
+    ) -> None:
         data, keep = _training(problem)
         device, horizon = problem.device, problem.horizon or 0
         self.size, self._encoder, self._device = size, encoder, device

@@ -19,8 +19,10 @@ FloatArray = npt.NDArray[np.float64]
 def discounted_visits(
     model: tabular.EmpiricalModel, policy: FloatArray, initial: FloatArray, gamma: float, horizon: int | None
 ) -> FloatArray:
-    """Return d (S, A) = sum_t gamma^t P(s_t = s, a_t = a, not ended): the solution of the flow equations
-    d(s, a) = pi(a|s) (initial(s) + gamma sum P(s|s', a') d(s', a')), or its first `horizon` terms.
+    """Return d (S, A) = sum_t gamma^t P(s_t = s, a_t = a, not ended).
+
+    It solves the flow equations d(s, a) = pi(a|s) (initial(s) + gamma sum P(s|s', a') d(s', a')); with a horizon it
+    is the sum of its first `horizon` terms.
 
     Args:
         model: the empirical model.
@@ -52,8 +54,13 @@ def discounted_visits(
 
 
 class TabularRatios(NamedTuple):
-    """zeta (P, n) of the n weighted rows, of mean 1; mass (P,) discounted time in pairs that these rows hold;
-    unsupported (P,) discounted probability of coming to a pair that the data does not hold, or not to weight."""
+    """What the flow equations give.
+
+    Attributes:
+        zeta: (P, n) ratios of the n weighted rows, of mean 1.
+        mass: (P,) discounted time in pairs that these rows hold.
+        unsupported: (P,) discounted probability of coming to a pair that the data does not hold, or not to weight.
+    """
 
     zeta: FloatArray
     mass: FloatArray

@@ -119,9 +119,7 @@ def train_ratios(
         TrainingError: if a ratio is not finite; the message names the policy.
     """
     encoder, policies = encoder_of(problem), len(problem.policies)
-    batches = DiceBatches(
-        problem, encoder, size=objective.batch_size, action_draws=objective.action_draws, seeds=seeds
-    )
+    batches = DiceBatches(problem, encoder, size=objective.batch_size, action_draws=objective.action_draws, seeds=seeds)
     architecture = Architecture(encoder.inputs, objective.hidden, encoder.heads)
     saddle = Saddle(architecture, objective, seeds=seeds, policies=policies, problem=problem)
     moments = _look_moments(objective.updates)

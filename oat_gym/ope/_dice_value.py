@@ -62,7 +62,5 @@ def ratio_diagnostics(zeta: FloatArray) -> list[Diagnostics]:
         total, squares = float(ratio.sum()), float(np.square(ratio).sum())
         size = total**2 / squares if squares else 0.0
         largest = float(np.abs(ratio).max() / abs(total)) if total else float("nan")
-        found.append(
-            {"mean_ratio": float(ratio.mean()), "effective_sample_size": size, "largest_weight": largest}
-        )
+        found.append({"mean_ratio": float(ratio.mean()), "effective_sample_size": size, "largest_weight": largest})
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
@@ -48,7 +48,7 @@ class DICE(Estimator):
     Restarts make episodes that end fit the theory. Let tau be the probability that a step of the policy's discounted
     occupancy d is the last of its episode: it terminates, or is the H-th of a horizon of H steps (the number of
     remaining steps is then part of the state, and data beyond the horizon is left out). If after such a step the next
-    one is (s0, a0), s0 an initial state and a0 ~ pi, then the occupancy of the alive steps, normalised to one, satisfies
+    one is (s0, a0), s0 an initial state and a0 ~ pi, the occupancy of the alive steps, normalised to one, satisfies
 
         d = (1 - gamma) mu0 pi + gamma P_restart' d
 
@@ -112,8 +112,8 @@ class DICE(Estimator):
     hidden: tuple[int, ...] = (64, 64)
     updates: int = 10_000
     batch_size: int = 256
-    nu_rate: float = 1e-3
-    zeta_rate: float = 1e-3
+    nu_rate: float = 3e-4
+    zeta_rate: float = 3e-3
     action_draws: int = 4
     family: ClassVar[str] = "DICE"
 
@@ -140,6 +140,8 @@ class DICE(Estimator):
         """Return the flags of a published method, as Yang et al. (2020, section 4) place it in the family.
 
         "dualdice" (Nachum et al., 2019), "gendice" (Zhang et al., 2020), "bestdice" (Yang et al., 2020; the default).
+        GenDICE, which regularises nu and not zeta, gets equal learning rates of 1e-3; the others settle with a nu that
+        is ten times slower than zeta.
 
         Args:
             name: the method.
@@ -150,20 +152,9 @@ class DICE(Estimator):
             raise ConfigurationError(f"DICE has the presets {', '.join(PRESETS)}, got {name!r}.")
         primal, dual, zero_reward, normalise, positive = PRESETS[name]
         chosen = cls(primal=primal, dual=dual, zero_reward=zero_reward, normalise=normalise, positive=positive)
-        if not original:
-            return chosen
-        return cls(
-            primal=primal,
-            dual=dual,
-            zero_reward=zero_reward,
-            normalise=normalise,
-            positive=positive,
-            updates=100_000,
-            batch_size=2_048,
-            nu_rate=1e-4,
-            zeta_rate=1e-4,
-            action_draws=1,
-        )
+        if original:
+            return replace(chosen, updates=100_000, batch_size=2_048, nu_rate=1e-4, zeta_rate=1e-4, action_draws=1)
+        return replace(chosen, nu_rate=1e-3, zeta_rate=1e-3) if name == "gendice" else chosen
 
     @property
     def name(self) -> str:

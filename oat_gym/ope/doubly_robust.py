@@ -119,7 +119,9 @@ class DoublyRobust(Estimator):
         rng = derive(seed, "doubly robust")
         errors = td_errors(problem, function, spans, draws=self.action_draws, rng=rng)
         start = _initial_values(problem, function, draws=self.action_draws, rng=rng)
-        results = [self._correction(problem, spans, weights, p, errors=errors[p], start=start[p]) for p in range(len(start))]
+        results = [
+            self._correction(problem, spans, weights, p, errors=errors[p], start=start[p]) for p in range(len(start))
+        ]
         diagnostics = weight_diagnostics(problem, spans, weights)
         _warn_of_size(problem, self.name, diagnostics)
         corrections = np.array([value for value, _, _ in results])
@@ -201,9 +203,7 @@ def normalised_errors(errors: FloatArray, logs: tuple[FloatArray, FloatArray], s
     return np.where(alive, scaled * errors[index] / np.where(total > 0, total, np.nan), 0.0)
 
 
-def magic_shares(
-    weighted: FloatArray, first: FloatArray, interval: tuple[float, float], *, count: int
-) -> FloatArray:
+def magic_shares(weighted: FloatArray, first: FloatArray, interval: tuple[float, float], *, count: int) -> FloatArray:
     """Return (T,): the share of each step's correction that MAGIC keeps.
 
     Args:

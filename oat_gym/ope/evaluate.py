@@ -93,9 +93,14 @@ def evaluate(
         EstimationWarning: where a value is not to be trusted; the rows' diagnostics hold its text too.
 
     >>> from oat_gym import domains, ope
-    >>> data = domains.load("maze2d-umaze").filter_episodes(lambda episode: episode.id < 30)
-    >>> noise = ope.FunctionPolicy(lambda states: np.zeros((len(states["observation"]), 2)), std=0.5)  # doctest: +SKIP
-    >>> result = ope.evaluate(data, {"noise": noise}, [ope.FQE()], gamma=0.99)  # doctest: +SKIP
+    >>> data = domains.load("maze2d-umaze").filter_episodes(lambda episode: episode.id < 20)
+    >>> policy = ope.FunctionPolicy(
+    ...     lambda state: np.zeros(2), action_space=data.action_space, density=lambda s, a: np.zeros(len(a))
+    ... )
+    >>> result = ope.evaluate(data, {"own": policy}, ope.ImportanceSampling(), gamma=0.99, behavior=policy, horizon=14)
+    >>> returns = [(episode.rewards[:14] * 0.99 ** np.arange(14)).sum() for episode in data]
+    >>> bool(np.isclose(result.rows[0]["value"], np.mean(returns)))
+    True
     """
     chosen, target, numbers = _estimators(estimators), PolicySet.of(policies), check_seeds(seeds)
     check_confidence(confidence)
@@ -143,15 +148,21 @@ class _Run:
 
 
 class _Factory:
-    """Makes one problem for each set of parts, which share target log-probabilities and cloned behaviour policies."""
+    """Makes one problem for each set of parts; estimators of the same parts share it, and with it what they fit."""
 
     def __init__(self, base: Problem, behavior: Behavior) -> None:
         self.label: Data = "augmented" if base.data.synthetic.any() else "real"
         self._base: Problem = base
         self._behavior: Behavior = behavior
         self._sources: dict[tuple[bool, bool], BehaviorSource] = {}
+        self._problems: dict[frozenset[Part], Problem] = {}
 
     def problem(self, parts: frozenset[Part]) -> Problem:
+        if parts not in self._problems:
+            self._problems[parts] = self._make(parts)
+        return self._problems[parts]
+
+    def _make(self, parts: frozenset[Part]) -> Problem:
         problem = replace(self._base, use_augmented=parts, behavior=self._source(parts))
         if problem.initial is not None:
             return problem
@@ -177,6 +188,7 @@ def _rows(run: _Run, seeds: tuple[int, ...], question: Question) -> tuple[list[R
         found = run.estimator.estimate(run.problem, seeds=seeds)
         _check_shapes(found, run, seeds)
         _warn_of_values(found, run)
+        _warn_of_certainty(found, run)
     for warning in caught:
         warnings.warn(warning.message, warning.category, stacklevel=3)
     texts = tuple(str(warning.message) for warning in caught if issubclass(warning.category, EstimationWarning))
@@ -234,6 +246,22 @@ def _warn_of_values(found: tuple[Estimates, ...], run: _Run) -> None:
             )
 
 
+def _warn_of_certainty(found: tuple[Estimates, ...], run: _Run) -> None:
+    """Warn of replicates that are all the same, as if the estimate had no error."""
+    for estimates in found:
+        spread_of = np.ptp(estimates.replicates, axis=1)
+        certain = (spread_of < 1e-12 * np.abs(estimates.values)) & (estimates.values != 0.0)
+        if certain.any():
+            warnings.warn(
+                f"{run.estimator.name}: {int(certain.sum())} of {len(certain)} estimates are the same in every "
+                "resample, so that their intervals have no width. Either all episodes are alike, or resamples reach "
+                "the initial states only, and not what was fitted: compare with other estimators and seeds.",
+                EstimationWarning,
+                stacklevel=2,
+            )
+            return
+
+
 def _estimators(estimators: Sequence[Estimator] | Estimator | None) -> tuple[Estimator, ...]:
     if estimators is None:
         return default_estimators()
@@ -254,7 +282,7 @@ def default_estimators() -> tuple[Estimator, ...]:
     """Return one estimator of each of the paper's five families, with their defaults."""
     from oat_gym import ope  # noqa: PLC0415  (the estimators of the package, this module among them)
 
-    return (ope.FQE(), ope.ImportanceSampling(), ope.DICE(), ope.DoublyRobust(), ope.ModelBased())
+    return tuple(kind() for kind in ope.ESTIMATORS.values())
 
 
 def _dataset(data: MinariDataset | str | PathLike[str]) -> MinariDataset:

@@ -13,8 +13,8 @@ from oat_gym.errors import ConfigurationError, EstimationWarning
 from oat_gym.ope._fqe_fits import NEEDS_TABLES, NetworkForm, fit_linear, fit_network, fit_tabular, is_tabular
 from oat_gym.ope._fqe_training import Settings
 from oat_gym.ope._q_data import QData, RewardScale
-from oat_gym.ope._q_function import FittedQ
-from oat_gym.ope.estimator import Estimates, Estimator
+from oat_gym.ope._q_function import FittedQ, value_scale
+from oat_gym.ope.estimator import Diagnostics, Estimates, Estimator
 from oat_gym.ope.problem import Problem
 
 Approximation = Literal["auto", "network", "tabular", "linear"]
@@ -23,7 +23,7 @@ MAX_UNSUPPORTED = 0.01
 MAX_CLIPPED = 0.1
 """Largest share of clipped targets that passes without a warning."""
 MAX_LATE_CHANGE = 0.05
-"""Largest change in the last tenth of the updates, of the value or of a twentieth of the bounds' width."""
+"""Largest change still to be expected, of the value or of a twentieth of the bounds' width."""
 
 
 @dataclass(frozen=True)
@@ -158,21 +158,30 @@ class FQE(Estimator):
     def fit_q(self, problem: Problem, *, seeds: Sequence[int]) -> tuple[FittedQ, ...]:
         """Return the action values of each seed, with their estimates, replicates and diagnostics.
 
+        A problem is fitted once: doubly robust estimation in the same evaluation uses the same fits.
+
         Raises:
             ConfigurationError: where the chosen form cannot be fitted.
             InvalidDataError: where values have no solution.
             TrainingError: where training diverges.
         """
         self.check(problem)
-        form = self.form(problem)
-        if form == "tabular":
-            fits = (fit_tabular(problem, bootstrap=self.bootstrap),) * len(seeds)
-        elif form == "linear":
-            fits = tuple(self._linear(problem, seed) for seed in seeds)
-        else:
-            fits = self._network(problem, seeds)
-        _warn(problem, fits, self.name)
+        missing = [seed for seed in seeds if (self, seed) not in problem.shared]
+        for seed, fit in zip(missing, self._fit(problem, missing), strict=True):
+            problem.shared[self, seed] = fit
+        fits: tuple[FittedQ, ...] = tuple(problem.shared[self, seed] for seed in seeds)
+        _warn(problem, fits, self)
         return fits
+
+    def _fit(self, problem: Problem, seeds: Sequence[int]) -> tuple[FittedQ, ...]:
+        form = self.form(problem)
+        if not seeds:
+            return ()
+        if form == "tabular":
+            return (fit_tabular(problem, bootstrap=self.bootstrap),) * len(seeds)
+        if form == "linear":
+            return tuple(self._linear(problem, seed) for seed in seeds)
+        return self._network(problem, seeds)
 
     def _network(self, problem: Problem, seeds: Sequence[int]) -> tuple[FittedQ, ...]:
         settings = Settings(self.updates, self.learning_rate, self.tau, self.weight_decay)
@@ -192,23 +201,33 @@ class FQE(Estimator):
         )
 
 
-def _warn(problem: Problem, fits: Sequence[FittedQ], name: str) -> None:
+def _warn(problem: Problem, fits: Sequence[FittedQ], fqe: FQE) -> None:
     """Warn of values that are not to be trusted, one warning for each reason."""
-    closed = "unsupported_mass" in fits[0].diagnostics[0]  # tables: exact, and gamma = 1 may have no bounds
-    low, high = (-np.inf, np.inf) if closed else RewardScale.of(QData.of(problem)).bounds(problem)
-    width, reasons = high - low, dict[str, set[str]]()
-
-    def found(reason: str, policy: str) -> None:
-        reasons.setdefault(reason, set()).add(policy)
-
+    reasons: dict[str, list[str]] = {}
+    # tables have no bounds: they are exact, and with gamma = 1 there may be none
+    tables = "unsupported_mass" in fits[0].diagnostics[0]
+    bounds = (-np.inf, np.inf) if tables else RewardScale.of(QData.of(problem)).bounds(problem)
     for fit in fits:
         for policy, value, numbers in zip(problem.policies.names, fit.values, fit.diagnostics, strict=True):
-            if numbers.get("unsupported_mass", 0.0) > MAX_UNSUPPORTED:
-                found("does what the data does not hold (unsupported_mass), which counts as 0", policy)
-            if abs(numbers.get("late_change", 0.0)) > MAX_LATE_CHANGE * max(abs(value), width / 20) > 0:
-                found("still changed in the last tenth of the updates (late_change): give more updates", policy)
-            if width > 0 and (numbers.get("share_clipped", 0.0) > MAX_CLIPPED or not low <= value <= high):
-                found(f"is at the bounds that the data's rewards allow, {low:.6g} to {high:.6g}", policy)
+            for reason in _reasons(problem, fqe, value, numbers, bounds=bounds):
+                reasons.setdefault(reason, []).append(policy)
     for reason, policies in reasons.items():
         chosen = ", ".join(p for p in problem.policies.names if p in policies)
-        warnings.warn(f"{name}: the value of {chosen} {reason}.", EstimationWarning, stacklevel=4)
+        warnings.warn(f"{fqe.name}: the value of {chosen} {reason}.", EstimationWarning, stacklevel=4)
+
+
+def _reasons(
+    problem: Problem, fqe: FQE, value: float, numbers: Diagnostics, *, bounds: tuple[float, float]
+) -> list[str]:
+    """Return what speaks against a value."""
+    (low, high), found = bounds, list[str]()
+    if numbers.get("unsupported_mass", 0.0) > MAX_UNSUPPORTED:
+        found.append("does what the data does not hold (unsupported_mass), which counts as 0")
+    if "late_change" in numbers:
+        # The value comes nearer by 1/e in about (sum of discounts) / tau updates, each backup taking 1 / tau.
+        ahead = max(1.0, 10 * value_scale(problem) / (fqe.tau * fqe.updates))
+        if abs(numbers["late_change"]) * ahead > MAX_LATE_CHANGE * max(abs(value), (high - low) / 20) > 0:
+            found.append("has not settled (late_change): give more updates, or a larger tau")
+    if high > low and (numbers.get("share_clipped", 0.0) > MAX_CLIPPED or not low <= value <= high):
+        found.append(f"is at the bounds that the data's rewards allow, {low:.6g} to {high:.6g}")
+    return found

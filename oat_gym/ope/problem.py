@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -51,7 +51,8 @@ class Problem:
     use_augmented: frozenset[Part] = frozenset()
     device: str = "cpu"
     progress: ProgressCallback = silent
-    _cache: dict[str, FloatArray] = field(default_factory=dict[str, FloatArray], repr=False, compare=False)
+    shared: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any], init=False, repr=False, compare=False)
+    """Results of this very problem that several estimators use; a changed copy (`replace`) starts without any."""
 
     def episodes(self, part: Part) -> BoolArray:
         """Return (E,) booleans: the episodes that `part` of an estimator may see."""
@@ -79,10 +80,10 @@ class Problem:
 
     def target_log_prob(self) -> FloatArray:
         """Return log pi(a|s) of every logged step under every policy, (P, n); computed once."""
-        if "target" not in self._cache:
+        if "target" not in self.shared:
             steps = self.data.steps
-            self._cache["target"] = self.policies.log_prob(steps.observations, steps.actions)
-        return self._cache["target"]
+            self.shared["target"] = self.policies.log_prob(steps.observations, steps.actions)
+        return self.shared["target"]
 
     def policy_actions(self, observations: Batch, *, rng: np.random.Generator) -> FloatArray:
         """Return features of one action of each policy, (P, n, A), drawn from it and clipped to the space."""

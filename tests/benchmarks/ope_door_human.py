@@ -13,12 +13,14 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import json
 import platform
 import subprocess
 import time
 import warnings
 from pathlib import Path
+from typing import Literal
 
 import gymnasium as gym
 import gymnasium_robotics
@@ -33,27 +35,28 @@ from oat_gym.ope import metrics
 GAMMA, HORIZON, TASK = 0.995, 200, "door"
 CLIP = (-6.0, 2.0)
 CENSORED = ope.BehaviorCloning(density="censored")
+_KINDS: tuple[Literal["per-decision", "trajectory"], ...] = ("per-decision", "trajectory")
+_FORMS: tuple[Literal["dr", "wdr", "magic"], ...] = ("wdr", "magic", "dr")
+_DICE: tuple[Literal["bestdice", "dualdice", "gendice"], ...] = ("bestdice", "dualdice", "gendice")
 
-CELLS: dict[str, tuple[ope.Estimator, int | None, str, str]] = {
-    # name: estimator, horizon, initial states, densities of behaviour and target policies
-    "fqe": (ope.FQE(), HORIZON, "data", "dope"),
-    "mb": (ope.ModelBased(), HORIZON, "data", "dope"),
-    "mb-autoregressive": (ope.ModelBased.preset("autoregressive"), HORIZON, "data", "dope"),
-    "is": (ope.ImportanceSampling(clip=CLIP), HORIZON, "data", "dope"),
-    "is-unclipped": (ope.ImportanceSampling(), HORIZON, "data", "dope"),
-    "is-censored": (ope.ImportanceSampling(clip=CLIP), HORIZON, "data", "censored"),
-    "is-trajectory": (ope.ImportanceSampling(kind="trajectory", clip=CLIP), HORIZON, "data", "dope"),
-    "dr": (ope.DoublyRobust(clip=CLIP), HORIZON, "data", "dope"),
-    "dice-best": (ope.DICE(), HORIZON, "data", "dope"),
-    "dice-dual": (ope.DICE.preset("dualdice"), HORIZON, "data", "dope"),
-    "dice-gen": (ope.DICE.preset("gendice"), HORIZON, "data", "dope"),
-    "fqe-endless": (ope.FQE(), None, "data", "dope"),
-    "mb-endless": (ope.ModelBased(), None, "data", "dope"),
-    "is-endless": (ope.ImportanceSampling(clip=CLIP), None, "data", "dope"),
-    "dice-endless": (ope.DICE(), None, "data", "dope"),
-    "fqe-reset": (ope.FQE(), HORIZON, "reset", "dope"),
-    "mb-reset": (ope.ModelBased(), HORIZON, "reset", "dope"),
-    "dice-reset": (ope.DICE(), HORIZON, "reset", "dope"),
+CELLS: dict[str, tuple[tuple[ope.Estimator, ...], int | None, str, str]] = {
+    # name: estimators, horizon, initial states, densities of behaviour and target policies
+    "is": (
+        tuple(ope.ImportanceSampling(kind=kind, clip=clip) for kind in _KINDS for clip in (CLIP, None)),
+        HORIZON,
+        "data",
+        "dope",
+    ),
+    "is-censored": ((ope.ImportanceSampling(clip=CLIP), ope.ImportanceSampling()), HORIZON, "data", "censored"),
+    "is-endless": ((ope.ImportanceSampling(clip=CLIP),), None, "data", "dope"),
+    "mb": ((ope.ModelBased(), ope.ModelBased.preset("autoregressive")), HORIZON, "data", "dope"),
+    "mb-endless": ((ope.ModelBased(),), None, "data", "dope"),
+    "mb-reset": ((ope.ModelBased(),), HORIZON, "reset", "dope"),
+    "fqe": ((ope.FQE(), *(ope.DoublyRobust(kind=kind, clip=CLIP) for kind in _FORMS)), HORIZON, "data", "dope"),
+    "dice": (tuple(ope.DICE.preset(name) for name in _DICE), HORIZON, "data", "dope"),
+    "fqe-endless": ((ope.FQE(), ope.DoublyRobust(clip=CLIP)), None, "data", "dope"),
+    "fqe-reset": ((ope.FQE(),), HORIZON, "reset", "dope"),
+    "dice-endless": ((ope.DICE(),), None, "data", "dope"),
 }
 PAPER = {  # tables 3 to 6, door, NoAug.: MAE, rank correlation, regret@1, regret@5
     "FQE": (389, 0.07, 0.05, 0.00),
@@ -62,7 +65,14 @@ PAPER = {  # tables 3 to 6, door, NoAug.: MAE, rank correlation, regret@1, regre
     "DR": (379, 0.01, 0.05, 0.00),
     "DICE": (978, 0.61, 0.38, 0.00),
 }
-MAIN = {"FQE": "fqe", "MB": "mb", "IS": "is", "DR": "dr", "DICE": "dice-best"}
+MAIN = {  # the estimator of each family that stands beside the paper's
+    "FQE": ope.FQE(),
+    "MB": ope.ModelBased(),
+    "IS": ope.ImportanceSampling(clip=CLIP),
+    "DR": ope.DoublyRobust(clip=CLIP),
+    "DICE": ope.DICE(),
+}
+MAIN_CELLS = ("fqe", "mb", "is", "dice")
 
 
 def reset_states(count: int) -> np.ndarray:
@@ -87,8 +97,8 @@ def _data() -> Path:
     return folder / "robotics" / "dope_policies"
 
 
-def run_cell(name: str, seeds: int, resets: int) -> dict[str, object]:
-    estimator, horizon, start, density = CELLS[name]
+def run_cell(name: str, seed: int, resets: int) -> dict[str, object]:
+    estimators, horizon, start, density = CELLS[name]
     data = domains.load("adroit-door-human")
     policies = ope.load_dope_policies(_data() / TASK, action_space=data.action_space, censored=density == "censored")
     begun = time.process_time()
@@ -97,10 +107,10 @@ def run_cell(name: str, seeds: int, resets: int) -> dict[str, object]:
         result = ope.evaluate(
             data,
             policies,
-            [estimator],
+            estimators,
             gamma=GAMMA,
             horizon=horizon,
-            seeds=seeds,
+            seeds=[seed],
             behavior=CENSORED if density == "censored" else "clone",
             initial_states=reset_states(resets) if start == "reset" else None,
         )
@@ -108,8 +118,8 @@ def run_cell(name: str, seeds: int, resets: int) -> dict[str, object]:
     rows = [row | {"diagnostics": part} for row, part in zip(result.rows, diagnostics, strict=True)]
     return {
         "cell": name,
-        "estimator": repr(estimator),
-        "family": estimator.family,
+        "estimators": {estimator.name: repr(estimator) for estimator in estimators},
+        "seed": seed,
         "horizon": horizon,
         "initial": start,
         "density": density,
@@ -128,104 +138,110 @@ def _commit() -> str:
 
 def run(out: Path, names: list[str], seeds: int, resets: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        path = out / f"{name}.json"
+    for name, seed in itertools.product(names, range(seeds)):
+        path = out / f"{name}-{seed}.json"
         if path.exists():
             continue
-        cell = run_cell(name, seeds, resets)
+        cell = run_cell(name, seed, resets)
         write_atomically(path, json.dumps(cell, indent=1).encode())
-        print(name, cell["cpu_seconds"], "CPU s", flush=True)
+        print(path.stem, cell["cpu_seconds"], "CPU s", flush=True)
 
 
-def summarize(cell: dict, true: dict[str, float]) -> dict[str, object]:
-    """Return the mean and standard deviation over seeds of each metric, and those of the mean over seeds."""
-    names, seeds = list(true), sorted({row["seed"] for row in cell["rows"]})
-    known = np.array([true[name] for name in names])
-    values = np.array(
-        [[row["value"] for name in names for row in cell["rows"] if (row["policy"], row["seed"]) == (name, seed)]
-         for seed in seeds]
-    )  # fmt: skip
+def summarize(rows: list[dict], true: dict[str, float]) -> dict[str, object]:
+    """Return mean and standard deviation over seeds of each metric, and those of the estimates averaged over seeds."""
+    names, seeds = list(true), sorted({row["seed"] for row in rows})
+    known, found = np.array(list(true.values())), {(row["seed"], row["policy"]): row["value"] for row in rows}
+    values = np.array([[found[seed, name] for name in names] for seed in seeds])
+    each = np.array([_scores(row, known) for row in values])
+    spread = each.std(axis=0, ddof=1) if len(seeds) > 1 else np.full(each.shape[1], np.nan)
+    numbers: dict[str, object] = {}
+    for metric, mean, sd, together in zip(
+        _METRICS, each.mean(axis=0), spread, _scores(values.mean(axis=0), known), strict=True
+    ):
+        numbers |= {metric: float(mean), f"{metric}_sd": float(sd), f"{metric}_of_mean": float(together)}
+    return numbers | {"bias": float((values - known).mean()), "seeds": len(seeds)}
 
-    def scores(v: np.ndarray) -> tuple[float, ...]:
-        return (
-            float(metrics.absolute_error(v, known).mean()),
-            metrics.rank_correlation(v, known),
-            metrics.regret_at_k(v, known, 1),
-            metrics.regret_at_k(v, known, 5),
-        )
 
-    each, row = np.array([scores(v) for v in values]), {"cell": cell["cell"], "family": cell["family"]}
-    for i, metric in enumerate(("mae", "rank", "regret1", "regret5")):
-        row |= {metric: each[:, i].mean(), f"{metric}_sd": each[:, i].std(ddof=1)}
-    average = scores(values.mean(axis=0))
-    row |= dict(zip(("mae_of_mean", "rank_of_mean", "regret1_of_mean", "regret5_of_mean"), average, strict=True))
-    row |= {"bias": float((values - known).mean()), "cpu_seconds": cell["cpu_seconds"], "seeds": len(seeds)}
-    return row | {"horizon": cell["horizon"] or "none", "initial": cell["initial"], "density": cell["density"]}
+def _scores(values: np.ndarray, true: np.ndarray) -> tuple[float, float, float, float]:
+    error, rank = metrics.absolute_error(values, true).mean(), metrics.rank_correlation(values, true)
+    return float(error), rank, metrics.regret_at_k(values, true, 1), metrics.regret_at_k(values, true, 5)
 
 
 def tables(out: Path) -> None:
     true = truth()
-    cells = [json.loads((out / f"{name}.json").read_text()) for name in CELLS if (out / f"{name}.json").exists()]
-    rows = [summarize(cell, true) for cell in cells]
+    cells = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
+    groups: dict[tuple[str, str], list[dict]] = {}
+    for name, row in ((cell["cell"], row) for cell in cells for row in cell["rows"]):
+        groups.setdefault((name, row["estimator"]), []).append(row)
+    setting = {cell["cell"]: {k: cell[k] for k in ("horizon", "initial", "density")} for cell in cells}
+    order = sorted(groups, key=lambda key: list(CELLS).index(key[0]))
+    rows = [{"cell": c, "estimator": e} | setting[c] | summarize(groups[c, e], true) for c, e in order]
     _write_csv(out / "summary.csv", rows)
+    columns = ("policy", "seed", "value", "standard_error", "low", "high")
     flat = [
-        {"cell": cell["cell"], "true": round(true[row["policy"]], 1)}
-        | {k: row[k] for k in ("policy", "seed", "value", "standard_error", "low", "high")}
-        for cell in cells
-        for row in cell["rows"]
+        {"cell": c, "estimator": e, "true": true[row["policy"]]} | {name: row[name] for name in columns}
+        for c, e in order
+        for row in groups[c, e]
     ]
     _write_csv(out / "policies.csv", flat)
-    (out / "summary.md").write_text(_markdown(rows, cells))
-    _draw(out / "values.png", cells, true)
+    shown = {f: (c, e.name) for f, e in MAIN.items() for c in MAIN_CELLS if (c, e.name) in groups}
+    (out / "summary.md").write_text(_markdown(rows, shown, cells))
+    _draw(out / "values.png", {f"{f}: {key[1]}": groups[key] for f, key in shown.items()}, true)
 
 
 def _write_csv(path: Path, rows: list[dict]) -> None:
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+        writer.writerows({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()} for row in rows)
 
 
-def _markdown(rows: list[dict], cells: list[dict]) -> str:
-    by_cell, lines = {row["cell"]: row for row in rows}, []
-    lines += ["| family | MAE | paper | rank | paper | regret@1 | paper | regret@5 | paper |", "|---|" + "---|" * 8]
-    shown = [(family, by_cell[name]) for family, name in MAIN.items() if name in by_cell]
-    for family, row in shown:
-        parts = [f"{row[m]:.{d}f} ± {row[m + '_sd']:.{d}f} | {PAPER[family][i]}" for i, (m, d) in enumerate(_METRICS)]
+def _markdown(rows: list[dict], shown: dict[str, tuple[str, str]], cells: list[dict]) -> str:
+    by_key = {(row["cell"], row["estimator"]): row for row in rows}
+    lines = ["| family | MAE | paper | rank | paper | regret@1 | paper | regret@5 | paper |", "|---|" + "---|" * 8]
+    for family, key in shown.items():
+        row = by_key[key]
+        parts = [f"{_pm(row, m, d)} | {PAPER[family][i]}" for i, (m, d) in enumerate(_METRICS.items())]
         lines.append(f"| {family} | " + " | ".join(parts) + " |")
-    if shown:
-        means = [f"{np.nanmean([row[m] for _, row in shown]):.{d}f}" for m, d in _METRICS]
-        paper = np.mean([PAPER[family] for family, _ in shown], axis=0)
-        cells_of_mean = [f"{m} | {p:.{d}f}" for m, p, (_, d) in zip(means, paper, _METRICS, strict=True)]
-        lines.append("| mean | " + " | ".join(cells_of_mean) + " |")
-    lines += ["", "| cell | horizon | initial | MAE | MAE of the mean over seeds | rank | of the mean | bias | CPU s |"]
-    lines += ["|---|" + "---|" * 8]
+    ours = [np.nanmean([by_key[key][m] for key in shown.values()]) for m in _METRICS]
+    paper = np.mean([PAPER[family] for family in shown], axis=0)
+    parts = [f"{a:.{d}f} | {b:.{d}f}" for a, b, d in zip(ours, paper, _METRICS.values(), strict=True)]
+    lines += ["| mean | " + " | ".join(parts) + " |", ""]
+    head = ("cell", "estimator", "horizon", "start", "MAE", "rank", "regret@1", "bias", "MAE of the mean", "its rank")
+    lines += ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for row in rows:
-        lines.append(
-            f"| {row['cell']} | {row['horizon']} | {row['initial']} | {row['mae']:.0f} ± {row['mae_sd']:.0f} "
-            f"| {row['mae_of_mean']:.0f} | {row['rank']:.2f} ± {row['rank_sd']:.2f} | {row['rank_of_mean']:.2f} "
-            f"| {row['bias']:+.0f} | {row['cpu_seconds']:.0f} |"
-        )
+        texts = [row["cell"], row["estimator"], str(row["horizon"] or "none"), row["initial"]]
+        texts += [_pm(row, "mae", 0), _pm(row, "rank", 2), _pm(row, "regret1", 2), f"{row['bias']:+.0f}"]
+        texts += [f"{row['mae_of_mean']:.0f}", f"{row['rank_of_mean']:.2f}"]
+        lines.append("| " + " | ".join(texts) + " |")
+    cost: dict[str, float] = {}
+    for part in cells:
+        cost[part["cell"]] = cost.get(part["cell"], 0.0) + part["cpu_seconds"]
+    spent = ", ".join(f"{name} {seconds:.0f}" for name, seconds in cost.items())
     commits = ", ".join(sorted({cell["commit"] for cell in cells}))
-    return "\n".join([*lines, "", f"Commits {commits}; {cells[0]['versions']}.", ""])
+    versions = ", ".join(f"{name} {version}" for name, version in cells[0]["versions"].items())
+    return "\n".join([*lines, "", f"CPU seconds, all seeds: {spent}. Commits {commits}; {versions}.", ""])
 
 
-_METRICS = (("mae", 0), ("rank", 2), ("regret1", 2), ("regret5", 2))
+def _pm(row: dict, metric: str, digits: int) -> str:
+    return f"{row[metric]:.{digits}f} ± {row[metric + '_sd']:.{digits}f}"
 
 
-def _draw(path: Path, cells: list[dict], true: dict[str, float]) -> None:
+_METRICS = {"mae": 0, "rank": 2, "regret1": 2, "regret5": 2}
+"""Digits that are shown of each."""
+
+
+def _draw(path: Path, panels: dict[str, list[dict]], true: dict[str, float]) -> None:
     import matplotlib.pyplot as plt
 
-    shown = [cell for cell in cells if cell["cell"] in MAIN.values()]
-    figure, axes = plt.subplots(1, len(shown), figsize=(3.1 * len(shown), 3.2), sharex=True, sharey=True)
+    figure, axes = plt.subplots(1, len(panels), figsize=(3.0 * len(panels), 3.2), sharex=True, sharey=True)
     known = np.array(list(true.values()))
-    for axis, cell in zip(np.atleast_1d(axes), shown, strict=True):
+    for axis, (title, rows) in zip(np.atleast_1d(axes), panels.items(), strict=True):
         axis.plot([known.min(), known.max()], [known.min(), known.max()], color="0.6", lw=1)
-        for row in cell["rows"]:
-            x = true[row["policy"]]
-            axis.plot([x, x], [row["low"], row["high"]], color=f"C{row['seed']}", alpha=0.35, lw=1)
-            axis.plot(x, row["value"], "o", ms=4, color=f"C{row['seed']}")
-        axis.set_title(cell["cell"])
+        for row in rows:
+            axis.plot([true[row["policy"]]] * 2, [row["low"], row["high"]], color=f"C{row['seed']}", alpha=0.35, lw=1)
+            axis.plot(true[row["policy"]], row["value"], "o", ms=4, color=f"C{row['seed']}")
+        axis.set_title(title, fontsize=9)
         axis.set_xlabel("true value")
     np.atleast_1d(axes)[0].set_ylabel("estimate (a colour for each seed)")
     figure.tight_layout()

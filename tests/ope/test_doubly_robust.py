@@ -112,7 +112,7 @@ def test_a_wrong_q_stays_unbiased(horizon: int | None) -> None:
 
 def test_without_action_values_it_is_importance_sampling() -> None:
     mdp = mdps.chain()
-    problem, policies = setting(mdp, 200)
+    problem, _ = setting(mdp, 200)
     zero = Known(np.zeros((2, mdp.n_states, mdp.n_actions)))
     for kind, weighted in (("dr", False), ("wdr", True)):
         ours = DoublyRobust(kind=kind, q=zero).estimate(problem, seeds=(0,))[0]
@@ -168,7 +168,7 @@ def test_magic_trusts_action_values_where_weights_vary_and_distrusts_wrong_ones(
     partial = np.concatenate((np.full((50, 1), 0.02), 0.02 + noise * [0.1, 0.2, 0.4, 0.8]), axis=1)
     partial -= partial.mean(axis=0) - 0.02
     assert blend_weights(partial, (0.9, 1.1))[0] > 0.99  # no variance, no bias
-    assert blend_weights(partial + [[1.0, 0, 0, 0, 0]], (0.9, 1.1))[0] < 0.5  # 50 from the interval
+    assert blend_weights(partial + np.eye(5)[0], (0.9, 1.1))[0] < 0.5  # 50 from the interval
     np.testing.assert_array_equal(partial_lengths(5, 20), np.arange(6))
     np.testing.assert_array_equal(partial_lengths(100, 3), [0, 50, 100])
     shares = step_shares(np.array([0.5, 0.3, 0.2]), np.array([0, 1, 3]), 3)

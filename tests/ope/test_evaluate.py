@@ -65,7 +65,7 @@ class Fixed(Estimator):
         if self.warning:
             warnings.warn(self.warning, EstimationWarning, stacklevel=1)
         policies, resamples = len(problem.policies), problem.resamples
-        noise = (resamples[:, 0] - 1.0) / 10
+        noise = (resamples[:, 0] - 1.0) / 10 * max(1.0, abs(self.value))
         used = float(problem.episodes("training").sum())
         return tuple(
             Estimates(
@@ -231,6 +231,16 @@ def test_values_that_no_reward_can_give_are_told(real: minari.MinariDataset, val
     with pytest.warns(EstimationWarning, match=message):
         result = ask(real, Fixed(value=value))
     assert len(result.rows[0]["diagnostics"]["warnings"]) == 1
+
+
+def test_an_estimate_without_error_is_told(real: minari.MinariDataset) -> None:
+    class Certain(Fixed):
+        def estimate(self, problem: Problem, *, seeds: tuple[int, ...]) -> tuple[Estimates, ...]:
+            found = super().estimate(problem, seeds=seeds)
+            return tuple(replace(each, replicates=np.ones_like(each.replicates)) for each in found)
+
+    with pytest.warns(EstimationWarning, match="3 of 3 estimates are the same in every resample"):
+        ask(real, Certain())
 
 
 def test_horizons_count_so_many_steps(real: minari.MinariDataset) -> None:

@@ -124,12 +124,13 @@ def test_weights_beyond_the_range_of_floats() -> None:
     problem = chain_problem(8, seed=7, length=30, policies=(LEFT,))
     shift = np.array([-4000.0, -2000.0, 0.0, 900.0, 1800.0, 2700.0, 3600.0, 5000.0])
     first = problem.data.offsets[:-1]
-    problem._cache["target"] = problem.behavior(0)[None].copy()
-    problem._cache["target"][0, first] += shift
     counts = np.array([[1, 1, 1, 1, 1, 1, 1, 1], [2, 2, 1, 1, 1, 1, 0, 0], [3, 5, 0, 0, 0, 0, 0, 0]], dtype=float)
+    problem = with_counts(problem, counts)
+    problem.shared["target"] = problem.behavior(0)[None].copy()
+    problem.shared["target"][0, first] += shift
     discounted = np.add.reduceat(problem.data.steps.rewards * GAMMA**problem.data.steps.step, first)
     for kind in ("trajectory", "per-decision"):
-        got = estimate(ImportanceSampling(kind=kind), with_counts(problem, counts))
+        got = estimate(ImportanceSampling(kind=kind), problem)
         np.testing.assert_allclose(got.replicates[0], discounted[[7, 5, 1]], rtol=1e-12)
         assert got.diagnostics[0]["effective_sample_size"] == pytest.approx(1)
         assert got.diagnostics[0]["largest_weight"] == pytest.approx(1)
@@ -224,7 +225,7 @@ def test_impossible_behaviour_and_densities_that_are_no_numbers() -> None:
     short = dataclasses.replace(problem, behavior=lambda seed: np.zeros(3))
     with pytest.raises(InvalidDataError, match=r"shape \(3,\), expected one for each"):
         ImportanceSampling().estimate(short, seeds=(0,))
-    problem._cache["target"] = np.full((2, len(problem.data.steps)), np.inf)
+    problem.shared["target"] = np.full((2, len(problem.data.steps)), np.inf)
     with pytest.raises(ConfigurationError, match="Policy 'policy-0' gives the action at step 0"):
         ImportanceSampling().estimate(problem, seeds=(0,))
 

@@ -1,0 +1,150 @@
+"""`oat-gym evaluate`: the values of policies from weight files, estimated from a dataset, augmented or not."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from gymnasium import spaces
+from minari import MinariDataset
+from rich.table import Table
+
+from oat_gym import ope
+from oat_gym.augmenters import AUGMENTERS
+from oat_gym.cache import write_atomically
+from oat_gym.cli._shared import Dataset, Factor, Seed, find_augmenter, open_source, out
+from oat_gym.dataset import AugmentedDataset
+from oat_gym.errors import ConfigurationError, InvalidDataError
+from oat_gym.progress import progress_bar
+
+_PARTS: dict[str, ope.UseAugmented] = {"training": None, "all": "all", "none": "none"}
+
+
+def evaluate(
+    dataset: Dataset,
+    policies: Annotated[Path, typer.Option(help="Folder of policy weights (npz, as the DOPE benchmark's).")],
+    estimators: Annotated[str, typer.Option(help=f"all, or some of {','.join(ope.ESTIMATORS)}.")] = "all",
+    gamma: Annotated[float, typer.Option(help="Discount.")] = 0.995,
+    horizon: Annotated[int | None, typer.Option(help="Steps whose rewards count; all without it.")] = None,
+    seeds: Annotated[int, typer.Option(help="How many seeds each estimator is run with.")] = 3,
+    augmenter: Annotated[str, typer.Option(help=f"none, or one of {', '.join(AUGMENTERS)}.")] = "none",
+    factor: Factor = 10,
+    seed: Seed = 0,
+    use_augmented: Annotated[
+        str, typer.Option(help=f"What sees synthetic episodes: {', '.join(_PARTS)}.")
+    ] = "training",
+    behavior: Annotated[str, typer.Option(help="Behaviour policy: clone, or logged (infos['log_prob']).")] = "clone",
+    truth: Annotated[Path | None, typer.Option(help="CSV of true values, columns policy and value.")] = None,
+    file: Annotated[Path | None, typer.Option("--out", help="CSV file for every estimate.")] = None,
+) -> None:
+    """Estimate what each policy would earn, from the episodes of DATASET.
+
+    With an augmenter (or a dataset that is augmented already) every estimate is made with and without the synthetic
+    episodes, and the change is shown.
+    """
+    chosen = _estimators(estimators)
+    if use_augmented not in _PARTS:
+        raise ConfigurationError(f"--use-augmented must be one of {', '.join(_PARTS)}, got {use_augmented!r}.")
+    if behavior not in ("clone", "logged"):
+        raise ConfigurationError(f"--behavior must be clone or logged, got {behavior!r}.")
+    known = None if truth is None else read_truth(truth)
+    data = _data(dataset, augmenter, factor, seed)
+    space = data.action_space
+    if not isinstance(space, spaces.Box):
+        raise ConfigurationError(f"Policies from weight files act in a Box; the actions of {data.id!r} are {space}.")
+    with progress_bar() as progress:
+        if isinstance(data, AugmentedDataset):
+            data.fit(progress=progress)
+        result = ope.evaluate(
+            data,
+            ope.load_dope_policies(policies, action_space=space),
+            chosen,
+            gamma=gamma,
+            horizon=horizon,
+            seeds=seeds,
+            behavior=behavior,
+            use_augmented=_PARTS[use_augmented],
+            paired=isinstance(data, AugmentedDataset) and use_augmented != "none",
+            progress=progress,
+        )
+    _print_rows(result.over_seeds(), ("policy", "estimator", "data", "value", "standard_error", "low", "high"))
+    if result.question.paired:
+        out.print("Change by the synthetic episodes:")
+        _print_rows(result.differences, ("policy", "estimator", "seed", "difference", "standard_error", "low", "high"))
+    if known is not None:
+        _print_rows(
+            result.compare(known),
+            ("estimator", "data", "seed", "mae", "rank_correlation", "regret_at_1", "regret_at_5"),
+        )
+    if file is not None:
+        write_atomically(file, to_csv(result.rows).encode())
+        out.print(f"Every estimate: {file}")
+
+
+def read_truth(path: Path) -> dict[str, float]:
+    """Return the true values of a CSV file with the columns policy and value.
+
+    Raises:
+        InvalidDataError: if a column is missing or a value is no finite number.
+    """
+    with path.open(newline="", encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    if not rows or not {"policy", "value"} <= set(rows[0]):
+        raise InvalidDataError(f"{path} must have the columns policy and value and a row for each policy.")
+    values: dict[str, float] = {}
+    for row in rows:
+        try:
+            values[row["policy"]] = float(row["value"])
+        except (TypeError, ValueError) as error:
+            raise InvalidDataError(f"{path}: the value of {row['policy']!r} is {row['value']!r}, no number.") from error
+    if not all(math.isfinite(value) for value in values.values()):
+        raise InvalidDataError(f"{path} has a value that is not finite.")
+    return values
+
+
+def to_csv(rows: list[dict[str, Any]]) -> str:
+    """Return estimates as CSV, the diagnostics in columns of their own."""
+    flat = [
+        {key: value for key, value in row.items() if key != "diagnostics"}
+        | {key: value for key, value in row["diagnostics"].items() if key != "warnings"}
+        for row in rows
+    ]
+    names = list(dict.fromkeys(key for row in flat for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(flat)
+    return text.getvalue()
+
+
+def _estimators(names: str) -> list[ope.Estimator]:
+    chosen = list(ope.ESTIMATORS) if names.strip() == "all" else [name.strip() for name in names.split(",")]
+    for name in chosen:
+        if name not in ope.ESTIMATORS:
+            raise ConfigurationError(f"There is no estimator {name!r}; choose of {', '.join(ope.ESTIMATORS)}.")
+    return [ope.ESTIMATORS[name]() for name in dict.fromkeys(chosen)]
+
+
+def _data(dataset: str, augmenter: str, factor: float, seed: int) -> MinariDataset:
+    source = open_source(dataset)
+    if augmenter == "none":
+        return source
+    return AugmentedDataset(source, find_augmenter(augmenter), factor=factor, seed=seed)
+
+
+def _print_rows(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> None:
+    names = [name for name in columns if name in rows[0]]
+    table = Table(box=None, pad_edge=False, header_style="")
+    for name in names:
+        table.add_column(name.replace("_", " "), justify="left" if name in ("policy", "estimator", "data") else "right")
+    for row in rows:
+        table.add_row(*(_cell(row[name]) for name in names))
+    out.print(table)
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,97 @@
+"""`oat-gym evaluate` as its user meets it."""
+
+import csv
+from pathlib import Path
+
+import minari
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from oat_gym import cli, ope
+from oat_gym.errors import ConfigurationError, DatasetNotFoundError, EstimationWarning, InvalidDataError
+
+
+@pytest.fixture
+def policies(tmp_path: Path) -> Path:
+    """Two policies of the walks: one steps right, one left."""
+    folder = tmp_path / "policies"
+    folder.mkdir()
+    for number, sign in enumerate((1.0, -1.0)):
+        np.savez(
+            folder / f"walk_{number}.npz",
+            **{
+                "fc0.weight": np.zeros((4, 2), np.float32),
+                "fc0.bias": np.zeros(4, np.float32),
+                "last_fc.weight": np.zeros((2, 4), np.float32),
+                "last_fc.bias": np.full(2, 0.2 * sign, np.float32),
+                "last_fc_log_std.weight": np.zeros((2, 4), np.float32),
+                "last_fc_log_std.bias": np.zeros(2, np.float32),
+                "nonlinearity": np.array("tanh"),
+                "output_distribution": np.array("gaussian"),
+            },
+        )
+    return folder
+
+
+def evaluate(*arguments: str) -> str:
+    result = CliRunner().invoke(
+        cli.app, ["evaluate", "test/walks-v0", "--estimators", "is", "--seeds", "1", *arguments]
+    )
+    if result.exception is not None:
+        raise result.exception
+    return result.output
+
+
+def test_the_values_of_the_library_are_printed_and_written(
+    walk_dataset: minari.MinariDataset, policies: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "values.csv"
+    with pytest.warns(EstimationWarning, match="effective sample size"):
+        printed = evaluate("--policies", str(policies), "--horizon", "6", "--gamma", "0.9", "--out", str(file))
+        known = ope.load_dope_policies(policies, action_space=walk_dataset.action_space)  # type: ignore[arg-type]
+        expected = ope.evaluate(walk_dataset, known, [ope.ImportanceSampling()], gamma=0.9, horizon=6, seeds=1)
+    rows = list(csv.DictReader(file.read_text().splitlines()))
+    assert [row["policy"] for row in rows] == ["walk_0", "walk_1"]
+    assert [float(row["value"]) for row in rows] == [row["value"] for row in expected.rows]
+    assert f"{expected.rows[0]['value']:.4g}" in printed
+
+
+def test_augmented_episodes_are_paired_and_the_truth_is_compared(
+    walk_dataset: minari.MinariDataset, policies: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "truth.csv").write_text("policy,value\nwalk_0,1.0\nwalk_1,-1.0\n")
+    with pytest.warns(EstimationWarning):
+        printed = evaluate(
+            *("--policies", str(policies), "--horizon", "6", "--truth", str(tmp_path / "truth.csv")),
+            *("--augmenter", "jittering", "--factor", "2", "--use-augmented", "all"),
+        )
+    for words in ("real", "augmented", "Change by the synthetic episodes", "mae", "regret at 1"):
+        assert words in printed
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        (["--estimators", "magic"], ConfigurationError, "no estimator 'magic'"),
+        (["--use-augmented", "half"], ConfigurationError, "--use-augmented must be one of"),
+        (["--behavior", "guess"], ConfigurationError, "clone or logged"),
+        (["--augmenter", "magic"], ConfigurationError, "no augmenter 'magic'"),
+        (["--gamma", "1.5", "--policies", "POLICIES"], ConfigurationError, "gamma must be"),
+        (["--truth", "BAD"], InvalidDataError, "columns policy and value"),
+        ([], DatasetNotFoundError, "no npz file"),
+    ],
+)
+def test_bad_input(
+    walk_dataset: minari.MinariDataset,
+    policies: Path,
+    tmp_path: Path,
+    case: tuple[list[str], type[Exception], str],
+) -> None:
+    arguments, error, message = case
+    (tmp_path / "bad.csv").write_text("name,worth\na,1\n")
+    (tmp_path / "empty").mkdir()
+    places = {"POLICIES": str(policies), "BAD": str(tmp_path / "bad.csv")}
+    given = ["--policies", str(tmp_path / "empty"), *(places.get(argument, argument) for argument in arguments)]
+    with pytest.raises(error, match=message):
+        evaluate(*given)
