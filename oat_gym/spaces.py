@@ -171,6 +171,11 @@ def map_tree(function: Callable[..., Any], batch: Batch, *others: Batch) -> Batc
     return function(batch, *others)
 
 
+def in_dtype_of(recorded: npt.NDArray[Any], made: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return a copy of `made` in the dtype of `recorded`; in its own where that would make integers of real numbers."""
+    return made.astype(recorded.dtype if np.can_cast(made.dtype, recorded.dtype, "same_kind") else made.dtype)
+
+
 def copy_tree(batch: Batch) -> Batch:
     """Return a copy that shares no memory with `batch`."""
     return map_tree(_copy_leaf, batch)

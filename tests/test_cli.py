@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from oat_gym import AUGMENTERS, OAT, AugmentedDataset, MiningConfig, cli, metrics
-from oat_gym.errors import AugmentationWarning
+from oat_gym.errors import AugmentationWarning, ConfigurationError
 from oat_gym.generation import BehaviorConfig, VAEMDPConfig
 
 
@@ -175,6 +175,14 @@ def test_compare_where_no_method_can_work(
     assert result.exit_code == 0, result.output
     assert "long: No episode is as long" in result.output
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["walks-v0.csv"]
+
+
+def test_compare_wants_a_folder(walk_dataset: minari.MinariDataset, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    arguments = ["compare", "test/walks-v0", "--augmenters", "jittering", "--out", str(tmp_path / "file")]
+    result = CliRunner().invoke(cli.app, arguments)
+    assert isinstance(result.exception, ConfigurationError)
+    assert "--out must be a folder" in str(result.exception)
 
 
 def test_demo_writes_one_folder_and_runs_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,7 +39,7 @@ def methods_in(augmenter: Augmenter) -> Iterator[Augmenter]:
 
 
 def joined_failures(parts: Sequence[Augmenter]) -> Mapping[str, str]:
-    """Return the expected failures of all parts, each with the name of the first part that has it."""
+    """Return what any part is expected to fail, which the whole may fail, with the name of the first part with it."""
     failures: dict[str, str] = {}
     for part in parts:
         for check, reason in part.expected_failures.items():

@@ -16,7 +16,7 @@ from oat_gym.errors import InvalidDataError
 from oat_gym.generation import Limits
 from oat_gym.generation.padded import PaddedSeries, split_rows
 from oat_gym.source import Source
-from oat_gym.spaces import Batch, map_tree, slice_tree
+from oat_gym.spaces import Batch, in_dtype_of, map_tree, slice_tree
 from oat_gym.stitching import Span, stitchable_copy
 
 
@@ -85,9 +85,10 @@ class WholeSampler(Sampler):
         episode = stitchable_copy(original, number=i)
         episode = dataclasses.replace(
             episode,
-            observations=map_tree(_copy_as, slice_tree(material.observations, rows), episode.observations),
-            actions=map_tree(_copy_as, slice_tree(material.actions, steps), episode.actions),
-            rewards=_copy_as(material.rewards[steps], episode.rewards),
+            # The recorded tree comes first: arrow reads no dataset whose episodes have their keys in different orders.
+            observations=map_tree(in_dtype_of, episode.observations, slice_tree(material.observations, rows)),
+            actions=map_tree(in_dtype_of, episode.actions, slice_tree(material.actions, steps)),
+            rewards=material.rewards[steps].astype(episode.rewards.dtype),
         )
         return Variation(episode, (Span(0, length, sample=k * len(self._source) + i),))
 
@@ -106,7 +107,3 @@ class WholeSampler(Sampler):
             state_bounds=self._source.flat_observations.bounds,
             action_bounds=self._source.flat_actions.bounds,
         )
-
-
-def _copy_as(values: Any, like: Any) -> Any:
-    return np.array(values, dtype=like.dtype)

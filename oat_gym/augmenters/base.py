@@ -73,7 +73,10 @@ class Augmenter(ABC):
     trains: ClassVar[bool] = True
     """Whether `fit` takes long enough for its result to be kept on disk."""
     expected_failures: ClassVar[Mapping[str, str]] = {}
-    """Checks of `oat_gym.checks.check_augmenter` that the method cannot pass, and the reason of each."""
+    """Checks of `oat_gym.checks.check_augmenter` that the method cannot pass, and the reason of each.
+
+    Of a method that is made of others they are those that it may fail.
+    """
 
     @property
     def at_zero_strength(self) -> Augmenter | None:

@@ -71,7 +71,7 @@ class Compose(Augmenter):
 
     @property
     def expected_failures(self) -> Mapping[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Those of the augmenters."""
+        """Those of the augmenters, which the whole may pass."""
         return joined_failures(self.augmenters)
 
     @property

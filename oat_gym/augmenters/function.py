@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from minari import EpisodeData
@@ -72,4 +73,15 @@ class _FunctionSampler(Sampler):
                 f"The function given to Function returned {len(result.rewards)} steps for episode {i} of "
                 f"{len(original.rewards)}; the length must stay, since it is announced before anything is generated."
             )
-        return Variation(result, (Span(0, len(result.rewards)),))
+        parts = ("observations", "actions", "infos")
+        ordered = {name: _in_key_order(getattr(original, name), getattr(result, name)) for name in parts}
+        return Variation(dataclasses.replace(result, **ordered), (Span(0, len(result.rewards)),))
+
+
+def _in_key_order(recorded: Any, made: Any) -> Any:
+    """Return `made`, its dictionaries in the order of the recorded ones: arrow reads no dataset with both orders."""
+    if isinstance(recorded, dict) and isinstance(made, dict) and recorded.keys() == made.keys():
+        return {key: _in_key_order(recorded[key], made[key]) for key in recorded}
+    if isinstance(recorded, tuple) and isinstance(made, tuple) and len(recorded) == len(made):
+        return tuple(_in_key_order(*pair) for pair in zip(recorded, made, strict=True))
+    return made

@@ -17,9 +17,9 @@ import numpy.typing as npt
 from minari import EpisodeData
 
 from oat_gym.episodes import BoolArray, IntArray
-from oat_gym.errors import ConfigurationError, InvalidDataError
+from oat_gym.errors import ConfigurationError
 from oat_gym.source import Source
-from oat_gym.spaces import Batch, FlatSpace, FloatMatrix, Layout, get_leaf, map_tree
+from oat_gym.spaces import Batch, FlatSpace, FloatMatrix, Layout, get_leaf, in_dtype_of, map_tree
 
 _CONSTANT = 1e-10  # a column whose spread is below this share of its size is constant up to rounding
 _KEPT_SERIES = 512
@@ -132,8 +132,8 @@ class Series:
         episode, spaces = self.source.episodes[i], self._flats
         return EpisodeData(
             id=i,
-            observations=map_tree(_in_dtype_of, episode.observations, spaces[0].unflatten(new.states)),
-            actions=map_tree(_in_dtype_of, episode.actions, spaces[1].unflatten(new.actions)),
+            observations=map_tree(in_dtype_of, episode.observations, spaces[0].unflatten(new.states)),
+            actions=map_tree(in_dtype_of, episode.actions, spaces[1].unflatten(new.actions)),
             rewards=_rewards_like(new.rewards, episode.rewards),
             terminations=_ending_of(episode.terminations, len(rows)),
             truncations=_ending_of(episode.truncations, len(rows)),
@@ -187,7 +187,7 @@ def check_series(source: Source, labels: tuple[int, ...] | None) -> None:
     source.flat_observations  # noqa: B018  (raises for a space that is not modelled)
     source.flat_actions  # noqa: B018
     if labels is not None and len(labels) != len(source):
-        raise InvalidDataError(
+        raise ConfigurationError(
             f"labels has {len(labels)} classes and the source {len(source)} episodes; one for each is needed, in the "
             "order of the (filtered) dataset that is augmented."
         )
@@ -233,7 +233,7 @@ def _per_spread(scale: Scale, layout: Layout) -> npt.NDArray[np.float64]:
 
 
 def _altered(flat: FlatSpace, batch: Batch, old: FloatMatrix, new: FloatMatrix) -> Batch:
-    made = map_tree(_in_dtype_of, batch, flat.unflatten(new))
+    made = map_tree(in_dtype_of, batch, flat.unflatten(new))
     unchanged = new == old
     for leaf in flat.leaves:
         target, recorded = get_leaf(made, leaf.path), get_leaf(batch, leaf.path)
@@ -242,10 +242,6 @@ def _altered(flat: FlatSpace, batch: Batch, old: FloatMatrix, new: FloatMatrix) 
         where = np.True_ if leaf.sizes else keep.reshape(target.shape)
         np.copyto(target, recorded, where=where, casting="unsafe")
     return made
-
-
-def _in_dtype_of(recorded: npt.NDArray[Any], made: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    return made.astype(recorded.dtype) if np.can_cast(made.dtype, recorded.dtype, "same_kind") else made
 
 
 def _rewards_like(rewards: FloatMatrix, recorded: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 import numpy.typing as npt
+from minari import EpisodeData
 
 from oat_gym._rng import derive
 from oat_gym.augmenters.base import Variation
@@ -27,7 +29,7 @@ from oat_gym.errors import AugmentationWarning, InvalidDataError
 from oat_gym.generation import Sequences, VAEMDPConfig
 from oat_gym.generation.config import check_integer
 from oat_gym.source import Source
-from oat_gym.spaces import Batch
+from oat_gym.spaces import Batch, map_tree
 from oat_gym.stitching import Seam, Span, literal_next_states, stitch_into, stitchable_copy
 
 Actions = Literal["behavior", "recorded"]
@@ -121,6 +123,22 @@ class StitchedSampler(GenerativeSampler):
     def _scale(self) -> npt.NDArray[np.float64]:
         return np.concatenate(self._data.states).std(axis=0)
 
+    @cached_property
+    def _no_rows(self) -> tuple[Batch, Batch]:
+        """Empty batches of observations and actions, in the dtypes in which they are generated."""
+        flats = self._source.flat_observations, self._source.flat_actions
+        observations, actions = (flat.unflatten(np.empty((0, flat.layout.width))) for flat in flats)
+        return observations, actions
+
+    def _with_room(self, episode: EpisodeData) -> EpisodeData:
+        """Return the episode, integers recorded for a space of real numbers as such: else generated ones were cut."""
+        observations, actions = self._no_rows
+        return dataclasses.replace(
+            episode,
+            observations=map_tree(_with_room_for, episode.observations, observations),
+            actions=map_tree(_with_room_for, episode.actions, actions),
+        )
+
     def generate(self, k: int) -> Arrays:
         """Roll out, for variation `k`, one sample for each span that it places, a batch for each set."""
         arrays: Arrays = {}
@@ -162,7 +180,7 @@ class StitchedSampler(GenerativeSampler):
     def variation(self, i: int, k: int, material: dict[int, SpanSamples]) -> Variation:
         """Stitch the samples of variation `k` into a copy of source episode `i`."""
         original = self._source.episodes[i]
-        episode = stitchable_copy(original, number=i)
+        episode = self._with_room(stitchable_copy(original, number=i))
         log_prob = np.full(len(episode.rewards), np.nan)
         spans: list[Span] = []
         before: dict[int, Batch] = {}
@@ -180,3 +198,8 @@ class StitchedSampler(GenerativeSampler):
                 last |= generated
         spans.sort(key=lambda span: span.start)
         return Variation(episode, tuple(spans), before | last, log_prob)
+
+
+def _with_room_for(recorded: npt.NDArray[Any], generated: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    fits = np.can_cast(generated.dtype, recorded.dtype, "same_kind")
+    return recorded if fits else recorded.astype(generated.dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ from oat_gym.generation import Samples, Sequences, VAEMDPConfig
 from oat_gym.generation.config import check_integer
 from oat_gym.progress import ProgressCallback, silent
 from oat_gym.source import Source
-from oat_gym.spaces import Batch, map_tree, slice_tree
+from oat_gym.spaces import Batch, in_dtype_of, map_tree, slice_tree
 from oat_gym.stitching import Span, stitchable_copy
 
 _NAME = "the entire trajectories"
@@ -163,9 +164,12 @@ class VAEMDPSampler(GenerativeSampler):
         episode = stitchable_copy(self._source.episodes[i], number=i)
         steps = slice(int(self._first[i]), int(self._first[i + 1]))
         states = slice(steps.start + i, steps.stop + i + 1)  # each episode before has one state more than steps
-        map_tree(_fill, episode.observations, slice_tree(material.observations, states))
-        map_tree(_fill, episode.actions, slice_tree(material.actions, steps))
-        episode.rewards[:] = material.rewards[steps]
+        episode = dataclasses.replace(
+            episode,
+            observations=map_tree(in_dtype_of, episode.observations, slice_tree(material.observations, states)),
+            actions=map_tree(in_dtype_of, episode.actions, slice_tree(material.actions, steps)),
+            rewards=material.rewards[steps].astype(episode.rewards.dtype),
+        )
         span = Span(0, len(episode.rewards), sample=k * len(self._source) + i)
         return Variation(episode, (span,), log_prob=material.log_prob[steps].copy())
 
@@ -231,7 +235,3 @@ def _padded(rows: list[npt.NDArray[np.float64]], length: int) -> npt.NDArray[np.
     for row, values in zip(padded, rows, strict=True):
         row[: len(values)] = values
     return padded
-
-
-def _fill(target: npt.NDArray[Any], values: npt.NDArray[Any]) -> None:
-    target[:] = values

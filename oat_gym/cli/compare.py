@@ -41,6 +41,8 @@ def compare(
     source = open_source(dataset)
     if not factor > 1:
         raise ConfigurationError(f"Generated episodes are compared: --factor must be more than 1, got {factor:g}.")
+    if folder.exists() and not folder.is_dir():
+        raise ConfigurationError(f"--out must be a folder, and {str(folder)!r} is a file: give another name.")
     folder.mkdir(parents=True, exist_ok=True)
     with progress_bar() as progress:
         rows = metrics.compare(source, methods, factor=factor, seed=seed, progress=progress)

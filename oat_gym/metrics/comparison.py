@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -16,6 +17,7 @@ from oat_gym.metrics.scores import Fidelity
 from oat_gym.metrics.steps import read_steps
 from oat_gym.progress import ProgressCallback, silent
 from oat_gym.report import real_episodes
+from oat_gym.synthesis import MAX_COUNT
 
 
 def fidelity(data: MinariDataset, *, seed: int = 0, limit: int = LIMIT) -> Fidelity:
@@ -79,7 +81,8 @@ def compare(
         progress: called as progress(description, done, total), for the methods' own work too.
 
     Raises:
-        ConfigurationError: for no augmenter, or a factor that is not over 1.
+        ConfigurationError: for no augmenter, or a factor that is not over 1, so near to 1 that it makes no episode,
+            or too large.
         InvalidDataError: for a dataset of fewer than 4 episodes.
 
     >>> from oat_gym import Function
@@ -90,15 +93,20 @@ def compare(
     methods = {name: kind() for name, kind in AUGMENTERS.items()} if augmenters is None else dict(augmenters)
     if not methods:
         raise ConfigurationError("There is no augmenter to compare; give at least one.")
-    if not factor > 1:
-        raise ConfigurationError(f"factor must be over 1, or nothing is generated to compare; got {factor!r}.")
+    if not 1 < factor < math.inf:
+        raise ConfigurationError(f"factor must be over 1 (and finite), or nothing is generated; got {factor!r}.")
     source = real_episodes(dataset if isinstance(dataset, MinariDataset) else find_source(dataset))
+    count = round((factor - 1) * len(source))
+    if not 1 <= count <= MAX_COUNT:
+        raise ConfigurationError(
+            f"A factor of {factor!r} of {len(source)} episodes makes {count} more; 1 to {MAX_COUNT} can be compared."
+        )
     judge = Judge.of(source, read_steps(source), seed=seed, limit=limit)
     rows: list[Comparison] = []
     for done, (name, augmenter) in enumerate(methods.items()):
         progress("Comparing", done, len(methods))
         try:
-            data = AugmentedDataset(source, augmenter, factor=factor, seed=seed)
+            data = AugmentedDataset(source, augmenter, count=count, seed=seed)
             data.fit(progress=_named(progress, name))
             contents = read_steps(data)
             rows.append(Comparison(name, augmenter, judge.fidelity(contents.generated, contents.seams), None))

@@ -106,12 +106,15 @@ class Judge:
         return self.scale.inputs(sample), self.scale.outcomes(sample)
 
     def _dynamics(self, generated: Steps) -> dict[str, Score]:
-        """Score steps made from one half's episodes by the model of the other half, beside the real ones in place."""
+        """Score steps by the model of the half that they were not made from, beside the real ones in their place.
+
+        What was made from episodes that are in neither half (a view that leaves them out) is scored by both models.
+        """
         members = halves(self.real, seed=self.seed)
         states: list[float] = []
         rewards: list[float] = []
         for h, model in enumerate(self._models):
-            theirs, held_out = (steps.take(np.isin(steps.episodes, members[1 - h])) for steps in (generated, self.real))
+            theirs, held_out = (steps.take(~np.isin(steps.episodes, members[h])) for steps in (generated, self.real))
             if len(theirs):
                 replaced = steps_in_place(held_out, theirs)
                 usual = model.errors(*self._regression(replaced if len(replaced) else held_out, h))

@@ -54,6 +54,8 @@ def discriminative_score(
 
     After Yoon et al., "Time-series generative adversarial networks" (NeurIPS 2019), on single steps: gradient boosted
     trees, cross-validated. 0: it cannot tell them; 1/2: it always can. The accuracy is the mean of the two classes'.
+    With few groups that hold one label each it is far from 1/2 by chance, to either side: between two halves of 25
+    episodes the score is about 0.1, of 8 episodes up to 0.35.
 
     Args:
         rows: (n, D) features.

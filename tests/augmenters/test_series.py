@@ -169,7 +169,7 @@ def test_labels_are_checked(kind: type, make_dataset: MakeDataset) -> None:
         kind(labels=[0, 1])
     with pytest.raises(ConfigurationError, match="tuple of integers"):
         kind(labels=(0, 1.5))
-    with pytest.raises(InvalidDataError, match="2 classes and the source 3 episodes"):
+    with pytest.raises(ConfigurationError, match="2 classes and the source 3 episodes"):
         AugmentedDataset(real, kind(labels=(0, 1)))
     assert config_from_json(kind, json.loads(json.dumps(canonical(kind(labels=(0, 1)))))) == kind(labels=(0, 1))
 

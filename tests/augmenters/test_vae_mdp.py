@@ -153,7 +153,7 @@ def test_what_is_generated_for_an_episode_goes_to_that_episode(
         states = start_states[:, None].repeat(steps + 1, axis=1)
         step = np.arange(steps) + np.zeros((count, 1))
         zeros = np.zeros((count, steps))
-        return Samples(states, states[:, 1:, :1], step, zeros, np.full(count, steps), zeros)
+        return Samples(states, states[:, 1:, 3:4], step, zeros, np.full(count, steps), zeros)  # behind the three modes
 
     monkeypatch.setattr(vae_mdp, "_BATCH_VALUES", values)
     real = make_dataset([3, 8, 1, 5, 8, 2])

@@ -13,7 +13,7 @@ import pytest
 import torch
 from minari import EpisodeData
 
-from oat_gym import OAT, Augmenter, Compose, Function, MiningConfig, Mixture, Span
+from oat_gym import DGW, OAT, Augmenter, Compose, Function, MiningConfig, Mixture, Span
 from oat_gym._rng import derive
 from oat_gym.augmenters.base import Sampler, Variation
 from oat_gym.checks import AUGMENTER_CHECKS, ChecksFailed, Report, check_augmenter
@@ -262,7 +262,9 @@ _kept: dict[Any, Any] = {}
 @dataclass(frozen=True)
 class SharesVariations(Sound):
     def spoil(self, episode: EpisodeData, source: Source, i: int, k: int) -> EpisodeData:
-        return dataclasses.replace(episode, truncations=_kept.setdefault((id(source), i), episode.truncations))
+        # with the source, whose id another one may get once it is gone
+        kept = _kept.setdefault((id(source), i), (source, episode.truncations))
+        return dataclasses.replace(episode, truncations=kept[1])
 
 
 @dataclass(frozen=True)
@@ -469,6 +471,13 @@ def test_settings_for_other_data_are_checked_on_that_alone(walk_dataset: minari.
         check_augmenter(OnlyWalks())
 
 
+def test_one_label_for_each_episode_is_for_one_dataset(walk_dataset: minari.MinariDataset) -> None:
+    report = check_augmenter(DGW(labels=(0, 1) * 6), walk_dataset, limit=4)
+    assert {name for name, _ in report.skipped} == {"continuous", "discrete", "alignment", "augmented-twice"}
+    assert "12 classes and the source 36 episodes" in dict(report.skipped)["augmented-twice"]
+    assert report.counts["conformance"]
+
+
 @dataclass(frozen=True)
 class OnlyWalks(Sound):
     def check(self, source: Source) -> None:
@@ -505,6 +514,15 @@ def test_expected_failures_are_reported_with_their_reason() -> None:
 def test_expected_failures_that_do_not_come_are_failures() -> None:
     _expect_only("memory", r"it was expected to fail \(it is careless\) but passed", Pessimist())
     _expect_only("memroy", r"expected to fail \(it is careless\), and no check has this name", Mistyped())
+
+
+def test_what_is_made_of_others_may_pass_what_its_parts_fail() -> None:
+    report = check_augmenter(Compose((Pessimist(), Sound())))
+    assert report.counts["memory"]
+    assert report.expected_failed == ()
+    report = check_augmenter(Mixture((Declared(), Sound())))
+    assert [name for name, _ in report.expected_failed] == ["zero-strength"]
+    _expect_only("memroy", "and no check has this name", Mixture((Mistyped(), Sound())))
 
 
 # Sound augmenters ---------------------------------------------------------------------------------------------------

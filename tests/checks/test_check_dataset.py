@@ -64,7 +64,7 @@ _counter = itertools.count()
 _kept: dict[int, dict[str, Any]] = {}
 
 SPOILT: list[tuple[str, str, Callable[[dict[str, Any]], dict[str, Any]]]] = [
-    ("t-plus-one", r"observations\['position'\] has 3 rows, expected 4 for 3 rewards", shifted),
+    ("t-plus-one", r"observations\['mode'\] has 3 rows, expected 4 for 3 rewards", shifted),
     ("t-plus-one", "actions has 2 rows, expected 3", lambda d: change(d, actions=d["actions"][:-1])),
     ("t-plus-one", "truncations has 2 rows, expected 3", lambda d: change(d, truncations=d["truncations"][:-1])),
     ("structure", "must be a dict with the keys", lambda d: change(d, observations={"position": 0})),

@@ -222,6 +222,14 @@ def test_variations_of_variations_belong_to_the_real_episode(walk_dataset):
         np.testing.assert_array_equal(mine.states[: len(walk_dataset[number])], walk_dataset[number].observations[:-1])
 
 
+def test_a_view_without_the_episodes_that_others_were_made_from(walk_dataset):
+    """What was made from episodes that the view leaves out was seen by neither half's model, so both score it."""
+    data = AugmentedDataset(walk_dataset, Function(lambda episode, rng: episode), factor=2)
+    found = fidelity(data.filter_episodes(lambda episode: episode.id < 5 or episode.id >= 18), limit=100)
+    assert 0.5 < found.dynamics.value < 2
+    assert 0.5 < found.reward.value < 2
+
+
 def test_literal_seams_keep_their_own_next_states(walk_dataset, tiny_oat):
     data = AugmentedDataset(walk_dataset, dataclasses.replace(tiny_oat, seam="literal"), factor=2)
     columns = data.transitions(flat=True)
@@ -338,9 +346,13 @@ def test_compare_of_an_augmented_dataset_uses_its_real_episodes(dataset):
 def test_compare_refuses_nothing_to_compare(dataset):
     with pytest.raises(ConfigurationError, match="no augmenter"):
         compare(dataset, {})
-    for factor in (1, 0.5, float("nan")):
+    for factor in (1, 0.5, float("nan"), float("inf")):
         with pytest.raises(ConfigurationError, match="factor must be over 1"):
             compare(dataset, None, factor=factor)
+    with pytest.raises(ConfigurationError, match="makes 0 more"):
+        compare(dataset, None, factor=1.01)
+    with pytest.raises(ConfigurationError, match="1 to 10000000 can be compared"):
+        compare(dataset, None, factor=1e30)
 
 
 def test_units_are_standard_deviations_and_one_hot_columns_stay():
