@@ -71,7 +71,10 @@ def evaluate(
             paired=isinstance(data, AugmentedDataset) and use_augmented != "none",
             progress=progress,
         )
-    _print_rows(result.over_seeds(), ("policy", "estimator", "data", "value", "standard_error", "low", "high"))
+    _print_rows(
+        result.over_seeds(),
+        ("policy", "estimator", "data", "value", "standard_error", "low", "high", "covers_training"),
+    )
     if result.question.paired:
         out.print("Change by the synthetic episodes:")
         _print_rows(result.differences, ("policy", "estimator", "seed", "difference", "standard_error", "low", "high"))

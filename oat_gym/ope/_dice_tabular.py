@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from oat_gym.episodes import IntArray
 from oat_gym.errors import InvalidDataError
 from oat_gym.ope import _q_tabular as tabular
 from oat_gym.ope._q_data import QData
@@ -57,9 +56,9 @@ class TabularRatios(NamedTuple):
     """What the flow equations give.
 
     Attributes:
-        zeta: (P, n) ratios of the n weighted rows, of mean 1.
+        zeta: (P, n) ratios of the n training rows, of mean 1.
         mass: (P,) discounted time in pairs that these rows hold.
-        unsupported: (P,) discounted probability of coming to a pair that the data does not hold, or not to weight.
+        unsupported: (P,) discounted probability of coming to a pair that they do not hold.
     """
 
     zeta: FloatArray
@@ -67,23 +66,20 @@ class TabularRatios(NamedTuple):
     unsupported: FloatArray
 
 
-def tabular_ratios(problem: Problem, data: QData, table: FloatArray, rows: IntArray) -> TabularRatios:
-    """Return the ratios of every policy; `table` is (P, S, A), `rows` (n,) the weighted rows of the data."""
+def tabular_ratios(problem: Problem, data: QData, table: FloatArray) -> TabularRatios:
+    """Return the ratios of every policy; `table` is (P, S, A)."""
     states, actions, following = (x.argmax(axis=1) for x in (data.states, data.actions, data.next_states))
     shape = (table.shape[1], table.shape[2])
     model = tabular.empirical_model(states, actions, data.rewards, following, data.terminated, shape=shape)
     first = problem.initial_states.argmax(axis=1)
     initial = np.bincount(first, minlength=shape[0]) / len(first)
-    pairs = problem.data.states[rows].argmax(axis=1) * shape[1] + problem.data.actions[rows].argmax(axis=1)
-    share = np.bincount(pairs, minlength=shape[0] * shape[1]) / len(pairs)
-    zeta, mass, unsupported = np.zeros((len(table), len(rows))), np.zeros(len(table)), np.zeros(len(table))
+    pairs, share = states * shape[1] + actions, model.visits.ravel() / len(states)
+    zeta, mass, unsupported = np.zeros((len(table), len(pairs))), np.zeros(len(table)), np.zeros(len(table))
     for p, policy in enumerate(table):
-        visits = discounted_visits(model, policy, initial, problem.gamma, problem.horizon).ravel()
-        seen = (share > 0) & (model.visits.ravel() > 0)
-        mass[p] = visits[seen].sum()
-        ratio = np.divide(visits, share * mass[p], out=np.zeros_like(visits), where=seen & (mass[p] > 0))
+        own = tabular.supported_policy(model, policy)
+        visits = discounted_visits(model, own, initial, problem.gamma, problem.horizon).ravel()
+        mass[p] = visits.sum()
+        ratio = np.divide(visits, share * mass[p], out=np.zeros_like(visits), where=(share > 0) & (mass[p] > 0))
         zeta[p] = ratio[pairs]
-        lost = tabular.unsupported_mass(model, policy, initial, problem.gamma, problem.horizon)
-        unweighted = visits[(share == 0) & (model.visits.ravel() > 0)].sum() / visits.sum()
-        unsupported[p] = max(lost, float(unweighted))
+        unsupported[p] = tabular.unsupported_mass(model, policy, initial, problem.gamma, problem.horizon)
     return TabularRatios(zeta, mass, unsupported)

@@ -123,7 +123,7 @@ def train_ratios(
     architecture = Architecture(encoder.inputs, objective.hidden, encoder.heads)
     saddle = Saddle(architecture, objective, seeds=seeds, policies=policies, problem=problem)
     moments = _look_moments(objective.updates)
-    halves = np.zeros((2, len(seeds) * policies, len(rows)), dtype=np.float32)
+    halves = np.zeros((2, len(seeds) * policies, len(rows)))
     with one_thread():
         for done in range(1, objective.updates + 1):
             saddle.update(batches.draw())
@@ -135,7 +135,7 @@ def train_ratios(
                 problem.progress(name, done, objective.updates)
     first = max(len(moments) // 2, 1)
     earlier, later = (
-        (part / count).astype(np.float64).reshape(len(seeds), policies, -1)
+        (part / count).reshape(len(seeds), policies, -1)
         for part, count in zip(halves, (first, max(len(moments) - first, 1)), strict=True)
     )
     trained = TrainedRatios(earlier if len(moments) > 1 else later, later)
@@ -148,10 +148,10 @@ def _look_moments(updates: int) -> list[int]:
     return sorted({first + round((updates - first) * k / LOOKS) for k in range(1, LOOKS + 1)})
 
 
-def _ratios(saddle: Saddle, problem: Problem, encoder: Encoder, rows: IntArray) -> npt.NDArray[np.float32]:
+def _ratios(saddle: Saddle, problem: Problem, encoder: Encoder, rows: IntArray) -> FloatArray:
     """Return zeta (K, n) of the rows."""
     members, device = len(saddle.zeta_layers[0][0]), problem.device
-    parts: list[npt.NDArray[np.float32]] = []
+    parts: list[FloatArray] = []
     for start in range(0, len(rows), BLOCK):
         block = rows[start : start + BLOCK]
         states = encoder.states(problem.data.states[block], device)[None]
@@ -161,7 +161,7 @@ def _ratios(saddle: Saddle, problem: Problem, encoder: Encoder, rows: IntArray) 
         raw = selected(
             forward(saddle.zeta_layers, inputs.expand(members, -1, -1))[-1], actions if encoder.discrete else None
         )
-        parts.append(saddle.ratio(raw).cpu().numpy())
+        parts.append(saddle.ratio(raw.double()).cpu().numpy())  # ratios may sink below what float32 holds
     return np.concatenate(parts, axis=1)
 
 

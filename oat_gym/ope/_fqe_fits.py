@@ -211,6 +211,7 @@ def _model(data: QData, shape: tuple[int, ...], weights: FloatArray | None) -> t
 
 
 def _values(problem: Problem, model: tabular.EmpiricalModel, policy: FloatArray) -> FloatArray:
+    policy = tabular.supported_policy(model, policy)
     if problem.horizon is None:
         return tabular.infinite_values(model, policy, problem.gamma)
     return tabular.finite_values(model, policy, problem.gamma, problem.horizon)

@@ -27,6 +27,18 @@ def blend_weights(partial: FloatArray, interval: tuple[float, float]) -> FloatAr
     return simplex_minimum(covariance + np.outer(bias, bias))
 
 
+def bias_interval(value: float, replicates: FloatArray) -> tuple[float, float]:
+    """Return the interval that biases are measured to: from the 5% to the 95% quantile of the (B,) replicates.
+
+    It is widened to hold the estimate itself. Replicates that are not finite are left out.
+    """
+    finite = replicates[np.isfinite(replicates)]
+    if not len(finite):
+        return value, value
+    low, high = np.quantile(finite, (0.05, 0.95))
+    return float(min(low, value)), float(max(high, value))
+
+
 def partial_lengths(n_steps: int, count: int) -> IntArray:
     """Return at most `count` numbers of weighted steps: 0 (action values alone) to all of them, evenly spread."""
     return np.unique(np.rint(np.linspace(0, n_steps, min(count, n_steps + 1))).astype(np.int64))

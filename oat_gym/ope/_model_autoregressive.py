@@ -153,20 +153,23 @@ class AutoregressiveModel:
     def advance(
         self, states: FloatArray, actions: FloatArray, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return next states (E, n, D), rewards (E, n) and probabilities of going on (E, n)."""
-        inputs = tensor(self.moves.scales[0](np.concatenate((states, actions), axis=2)), self.device)
+        """Return next states (E, P, n, D), rewards (E, P, n) and probabilities of going on (E, P, n)."""
+        shape = states.shape[:3]
+        flat = np.concatenate((states, actions), axis=3).reshape(len(states), shape[1] * shape[2], -1)
+        inputs = tensor(self.moves.scales[0](flat), self.device)
         width, n_state = inputs.shape[2], len(self.factors) - 1 - int(self.moves.ends)
         x = torch.cat((inputs, inputs.new_zeros(*inputs.shape[:2], self.moves.layout.width)), dim=2)
         for factor, layers in zip(self.factors[:n_state], self.layers, strict=False):
             raw, size = forward(layers, x)[-1], max(factor.categories, 1)
-            drawn = _draw(raw, factor, rng)
-            x[..., width + factor.start : width + factor.start + size] = drawn
-        changes = x[..., width:].cpu().numpy().astype(np.float64)
+            drawn = _draw(raw.view(*shape, -1), factor, rng)
+            x[..., width + factor.start : width + factor.start + size] = drawn.view(*x.shape[:2], size)
+        changes = x[..., width:].cpu().numpy().astype(np.float64).reshape(*shape, -1)
         raw = forward(self.layers[n_state], x)[-1][..., :1]
-        rewards = self.moves.scales[2].inverse(raw.cpu().numpy().astype(np.float64))[..., 0]
+        rewards = self.moves.scales[2].inverse(raw.cpu().numpy().astype(np.float64)).reshape(shape)
         going = np.ones_like(rewards)
         if self.moves.ends:
-            going = forward(self.layers[-1], x)[-1][..., :2].softmax(dim=-1)[..., 1].cpu().numpy().astype(np.float64)
+            goes_on = forward(self.layers[-1], x)[-1][..., :2].softmax(dim=-1)[..., 1]
+            going = goes_on.cpu().numpy().astype(np.float64).reshape(shape)
         return self.moves.next_states(states, changes), rewards, going
 
 
@@ -210,11 +213,12 @@ def _gaussian(raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _draw(raw: Tensor, factor: Variable, rng: np.random.Generator) -> Tensor:
-    """Return (E, n, columns) draws of one factor."""
+    """Return (E, P, n, columns) draws of one factor, with the same random numbers for each of P."""
     if factor.categories:
         probabilities = raw[..., : factor.categories].softmax(dim=-1).cpu().numpy().astype(np.float64)
         drawn = one_hot_draw(probabilities, rng)
     else:
         mean, log_std, _ = (part.cpu().numpy() for part in _gaussian(raw))
-        drawn = (mean + np.exp(log_std) * rng.standard_normal(mean.shape))[..., None]
+        noise = rng.standard_normal((len(mean), 1, mean.shape[2]))
+        drawn = (mean + np.exp(log_std) * noise)[..., None]
     return torch.from_numpy(drawn).to(raw)

@@ -86,13 +86,12 @@ class Moves:
         """Take the rows of the problem's training part."""
         data, layout = QData.of(problem), problem.data.flat_observations.layout
         going = ~data.terminated
-        if not going.any():
-            raise InvalidDataError("Every training episode ends after one step: there is no dynamics to learn.")
+        moving = going if going.any() else ~going  # where every episode is one step long, no move matters
         inputs = np.concatenate((data.states, data.actions), axis=1)
         changes = data.next_states.copy()
         real = list(layout.continuous)
         changes[:, real] -= data.states[:, real]
-        of_changes = Scale.of(changes[going])
+        of_changes = Scale.of(changes[moving])
         of_changes.center[_one_hot(layout)], of_changes.spread[_one_hot(layout)] = 0.0, 1.0
         scales = Scale.of(inputs), of_changes, Scale.of(data.rewards[:, None])
         seen = np.concatenate((data.states, data.next_states))
@@ -165,7 +164,7 @@ def split(
             if bootstrap:
                 counts = problem.resamples[member % len(problem.resamples)]
                 rows = np.repeat(rows, counts[moves.unit[rows]].astype(np.int64))
-            if not (len(rows) and moves.going[rows].any()):
+            if not len(rows) or (moves.going.any() and not moves.going[rows].any()):
                 raise InvalidDataError("A dynamics model has no episode to learn from: there are too few episodes.")
             training.append(rows)
             held.append(np.resize(rng.permutation(np.flatnonzero(out)) if not member else held[-1], size))

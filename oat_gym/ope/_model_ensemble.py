@@ -80,7 +80,7 @@ class EnsembleModel:
     Attributes:
         changes: layers of the state change, fitted where the episode goes on.
         rewards: layers of the reward.
-        going: layers of the probability of going on; None where no episode terminates.
+        going: layers of the probability of going on; None where no step, or every one, terminates.
         moves: scales and ranges.
         errors: held-out errors of state and reward, 1 for predicting the mean.
         device: torch device.
@@ -107,14 +107,17 @@ class EnsembleModel:
     def advance(
         self, states: FloatArray, actions: FloatArray, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return next states (E, n, D), rewards (E, n) and probabilities of going on (E, n)."""
-        blocks = self.moves.layout.categorical
-        x = tensor(self.moves.scales[0](np.concatenate((states, actions), axis=2)), self.device)
-        changes = _numpy(means(forward(self.changes, x)[-1], blocks, probability=False))
+        """Return next states (E, P, n, D), rewards (E, P, n) and probabilities of going on (E, P, n)."""
+        blocks, shape = self.moves.layout.categorical, states.shape[:3]
+        inputs = np.concatenate((states, actions), axis=3).reshape(len(states), shape[1] * shape[2], -1)
+        x = tensor(self.moves.scales[0](inputs), self.device)
+        changes = _numpy(means(forward(self.changes, x)[-1], blocks, probability=False)).reshape(*shape, -1)
         for start, stop in blocks:
             changes[..., start:stop] = one_hot_draw(changes[..., start:stop], rng)
-        rewards = self.moves.scales[2].inverse(_numpy(forward(self.rewards, x)[-1]))[..., 0]
-        going = np.ones_like(rewards) if self.going is None else _numpy(forward(self.going, x)[-1].sigmoid())[..., 0]
+        rewards = self.moves.scales[2].inverse(_numpy(forward(self.rewards, x)[-1])).reshape(shape)
+        going = np.full(shape, self.moves.going.max())
+        if self.going is not None:
+            going = _numpy(forward(self.going, x)[-1].sigmoid()).reshape(shape)
         return self.moves.next_states(states, changes), rewards, going
 
 
@@ -126,12 +129,12 @@ def fit_ensemble(moves: Moves, split: Split, fitting: Fitting, *, seeds: Sequenc
     """
     hidden, device, size = fitting.hidden, fitting.device, fitting.ensemble
     state = MeanTask(moves.inputs, moves.changes, blocks=moves.layout.categorical, hidden=hidden, device=device)
-    changes = fit(state, split.where(moves.going > 0), fitting, seeds=seeds, part="state")
+    changes = fit(state, split.where((moves.going > 0) | (moves.going.max() == 0)), fitting, seeds=seeds, part="state")
     rewards = fit(
         MeanTask(moves.inputs, moves.rewards, hidden=hidden, device=device), split, fitting, seeds=seeds, part="reward"
     )
     going: Fitted | None = None
-    if moves.ends:
+    if moves.ends and moves.going.any():
         event = MeanTask(moves.inputs, moves.going[:, None], probability=True, hidden=hidden, device=device)
         going = fit(event, split, fitting, seeds=seeds, part="continuation")
     parts = [slice(k * size, (k + 1) * size) for k in range(len(seeds))]
@@ -149,9 +152,10 @@ def fit_ensemble(moves: Moves, split: Split, fitting: Fitting, *, seeds: Sequenc
 
 
 def one_hot_draw(probabilities: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return one-hot draws (..., C) from probabilities (..., C)."""
+    """Return one-hot draws (E, P, n, C) from probabilities (E, P, n, C), with the same random numbers for each of P."""
     edges = probabilities.cumsum(axis=-1)
-    codes = (rng.random((*edges.shape[:-1], 1)) * edges[..., -1:] >= edges).sum(axis=-1)
+    members, _, n, _ = edges.shape
+    codes = (rng.random((members, 1, n, 1)) * edges[..., -1:] >= edges).sum(axis=-1)
     return np.eye(edges.shape[-1])[codes.clip(max=edges.shape[-1] - 1)]
 
 

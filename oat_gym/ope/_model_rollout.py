@@ -52,7 +52,11 @@ class MemberModel(Protocol):
     def advance(
         self, states: FloatArray, actions: FloatArray, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return next states (E, n, D), rewards (E, n) and probabilities of going on (E, n)."""
+        """Return next states (E, P, n, D), rewards (E, P, n) and probabilities of going on (E, P, n).
+
+        States (E, P, n, D) and actions (E, P, n, A) are those of P policies, for which the same numbers are drawn: a
+        policy's roll-outs do not depend on the others, and differences between policies have less noise.
+        """
         ...
 
 
@@ -76,16 +80,22 @@ class GivenModel:
     def advance(
         self, states: FloatArray, actions: FloatArray, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Take one step of the model, and check its shapes."""
-        found = self.model.step(states[0], actions[0], rng=rng)
-        following, rewards, going = (np.asarray(part, dtype=np.float64) for part in found)
-        shapes, n = (following.shape, rewards.shape, going.shape), states.shape[1]
-        if shapes != (states[0].shape, (n,), (n,)):
+        """Take one step of the model."""
+        own = streams(rng, states.shape[1])
+        found = [self._step(*each) for each in zip(states[0], actions[0], own, strict=True)]
+        following, rewards, going = (np.stack(part)[None] for part in zip(*found, strict=True))
+        return following, rewards, going
+
+    def _step(self, states: FloatArray, actions: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, ...]:
+        found = self.model.step(states, actions, rng=rng)
+        parts, n = tuple(np.asarray(part, dtype=np.float64) for part in found), len(states)
+        shapes = tuple(part.shape for part in parts)
+        if shapes != (states.shape, (n,), (n,)):
             raise InvalidDataError(
-                f"model.step must return next states {states[0].shape}, rewards ({n},) and continuations ({n},), got "
+                f"model.step must return next states {states.shape}, rewards ({n},) and continuations ({n},), got "
                 f"shapes {shapes}."
             )
-        return following[None], rewards[None], going[None]
+        return parts
 
 
 @dataclass(frozen=True)
@@ -152,15 +162,12 @@ def _chunk(
     clipped, lived, discount, ranges = np.zeros(policies), np.zeros(policies), 1.0, model.ranges
     for _ in range(limits.max_steps if horizon is None else horizon):
         actions = _actions(problem, states, own)
-        flat = (members, policies * n, -1)
-        following, rewards, going = model.advance(states.reshape(flat), actions.reshape(flat), rngs[0])
-        rewards = np.clip(rewards, ranges.least_reward, ranges.greatest_reward).reshape(alive.shape)
-        values += discount * alive * rewards
-        following = following.reshape(states.shape)
+        following, rewards, going = model.advance(states, actions, rngs[0])
+        values += discount * alive * np.clip(rewards, ranges.least_reward, ranges.greatest_reward)
         states = np.clip(following, ranges.low, ranges.high)
         clipped += (alive * (states != following).any(axis=3)).sum(axis=(0, 2))
         lived += alive.sum(axis=(0, 2))
-        alive *= going.reshape(alive.shape)
+        alive *= going
         discount *= problem.gamma
         if horizon is None and discount * alive.max() < limits.tolerance:
             break

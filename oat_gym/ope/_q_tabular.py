@@ -11,6 +11,9 @@ from oat_gym.episodes import BoolArray, IntArray
 from oat_gym.errors import ConfigurationError, InvalidDataError
 
 FloatArray = npt.NDArray[np.float64]
+MAX_UNSUPPORTED = 0.01
+"""Largest probability of coming to pairs that the data does not hold that passes without a warning."""
+UNSUPPORTED = "does what the data does not hold (unsupported_mass), where it is taken to do what the data holds instead"
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,28 @@ def empirical_model(
     )
 
 
+def supported_policy(model: EmpiricalModel, policy: FloatArray) -> FloatArray:
+    """Return a policy (S, A) kept to the actions that the data holds in each state.
+
+    Their probabilities are scaled to sum to one; where the policy takes none of them, it acts as the data does. To
+    count what is not known as 0 would make a policy that leaves the data the best of all where rewards are negative,
+    and the worst where they are positive. Rows of states that no transition leaves are zero: nothing is known there.
+
+    >>> model = empirical_model(
+    ...     np.array([0, 0, 1]), np.array([0, 1, 1]), np.zeros(3), np.array([1, 1, 0]), np.zeros(3, dtype=bool),
+    ...     shape=(3, 3)
+    ... )
+    >>> supported_policy(model, np.array([[0.2, 0.3, 0.5], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+    array([[0.4, 0.6, 0. ],
+           [0. , 1. , 0. ],
+           [0. , 0. , 0. ]])
+    """
+    kept = np.where(model.visits > 0, policy, 0.0)
+    kept = np.where(kept.sum(axis=1, keepdims=True) > 0, kept, model.visits)
+    total = kept.sum(axis=1, keepdims=True)
+    return np.divide(kept, total, out=np.zeros_like(kept), where=total > 0)
+
+
 def infinite_values(model: EmpiricalModel, policy: FloatArray, gamma: float) -> FloatArray:
     """Return V (S,) of a policy (S, A): the solution of V = sum_a pi (r + gamma P V).
 
@@ -121,7 +146,8 @@ def unsupported_mass(
 ) -> float:
     """Return the discounted probability that a policy, from `initial` (S,), comes to a pair that was never seen.
 
-    The empirical model knows nothing of what happens then: the value counts nothing from there on.
+    `supported_policy` then stands in for the policy. A state that no transition leaves counts as such a pair, and the
+    value holds nothing of what comes after it.
     """
     unseen = (policy * (model.visits == 0)).sum(axis=1)
     chain = gamma * model.chain(policy)
@@ -137,7 +163,8 @@ def unsupported_mass(
 class TabularQ:
     """Exact action values in an empirical model; states and actions come as one-hot features.
 
-    `values` is V, (P, S), or with a horizon H (P, H + 1, S).
+    An action that the data does not hold in a state is worth V there, so that the mean of Q under the policy is that
+    under `supported_policy`. `values` is V, (P, S), or with a horizon H (P, H + 1, S).
     """
 
     model: EmpiricalModel
@@ -155,13 +182,18 @@ class TabularQ:
 
     def _pairs(self, values: FloatArray, state: IntArray, action: IntArray, remaining: IntArray | None) -> FloatArray:
         if remaining is None:
-            return (self.model.rewards + self.gamma * self.model.expect(values))[state, action]
+            return self._table(values, values)[state, action]
         result = np.zeros(len(state))
         for h in np.unique(remaining[remaining > 0]):
-            table = self.model.rewards + self.gamma * self.model.expect(values[h - 1])
+            table = self._table(values[h - 1], values[h])
             chosen = remaining == h
             result[chosen] = table[state[chosen], action[chosen]]
         return result
+
+    def _table(self, after: FloatArray, own: FloatArray) -> FloatArray:
+        """Return (S, A) action values from the values (S,) of next states and of the states themselves."""
+        table = self.model.rewards + self.gamma * self.model.expect(after)
+        return np.where(self.model.visits > 0, table, own[:, None])
 
 
 def _sums(index: IntArray, values: FloatArray, size: int) -> FloatArray:

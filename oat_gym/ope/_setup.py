@@ -12,7 +12,7 @@ from gymnasium import spaces
 from oat_gym._rng import check_seed, derive
 from oat_gym.episodes import BoolArray
 from oat_gym.errors import ConfigurationError
-from oat_gym.ope.behavior import fit_log_prob, logged_log_prob
+from oat_gym.ope.behavior import KnownBehavior, fit_log_prob, logged_log_prob
 from oat_gym.ope.cloning import BehaviorCloning
 from oat_gym.ope.estimator import Estimator
 from oat_gym.ope.logged import Logged
@@ -69,8 +69,7 @@ class BehaviorSource:
             )
             self.held_out[seed] = fit.held_out_log_likelihood
             return fit.log_prob
-        steps = problem.data.steps
-        return np.asarray(behavior.log_prob(steps.observations, steps.actions), dtype=np.float64)
+        return KnownBehavior(behavior).log_prob(problem.data, episodes=self._weighted)
 
 
 def check_behavior(behavior: Behavior) -> None:

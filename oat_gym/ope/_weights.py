@@ -70,10 +70,8 @@ def importance_weights(problem: Problem, seed: int, *, log_ratio_clip: Clip | No
         counted &= problem.data.steps.step < problem.horizon
     behavior = _check_behavior(np.asarray(problem.behavior(seed), dtype=np.float64), counted, problem)
     target = _check_target(problem.target_log_prob(), counted, problem)
-    counted = (
-        np.ones(len(behavior), dtype=bool) if problem.horizon is None else problem.data.steps.step < problem.horizon
-    )
-    log_ratio = target - behavior
+    with np.errstate(invalid="ignore"):  # of steps that do not count
+        log_ratio = target - behavior
     log_ratio[:, ~counted] = 0.0
     clipped = np.zeros(len(log_ratio))
     if log_ratio_clip is not None:

@@ -211,15 +211,26 @@ class KnownBehavior:
 
     policy: Policy
 
-    def log_prob(self, logged: Logged) -> FloatArray:
+    def log_prob(self, logged: Logged, *, episodes: BoolArray | None = None) -> FloatArray:
         """Return log beta(a|s) of every logged step, (n,).
 
+        Args:
+            logged: the data.
+            episodes: (E,) the episodes whose steps will be used, all by default; generated actions of others may be
+                impossible.
+
         Raises:
-            InvalidDataError: if the policy calls a logged action impossible: then it did not record the data.
+            InvalidDataError: if the policy calls a logged action impossible: then it did not record the data; or if it
+                does not give one number for each step.
         """
         steps = logged.steps
         values = np.asarray(self.policy.log_prob(steps.observations, steps.actions), dtype=np.float64)
-        bad = np.flatnonzero(~np.isfinite(values))
+        if values.shape != (len(steps),):
+            raise InvalidDataError(
+                f"The behaviour policy gives log-probabilities of shape {values.shape} for {len(steps)} steps."
+            )
+        rows = np.arange(len(steps)) if episodes is None else logged.rows_of(episodes)
+        bad = rows[~np.isfinite(values[rows])]
         if len(bad):
             raise InvalidDataError(
                 f"The behaviour policy gives step {steps.step[bad[0]]} of episode {steps.episode[bad[0]]} the "

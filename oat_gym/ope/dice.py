@@ -19,6 +19,7 @@ from oat_gym.ope._dice_value import ratio_diagnostics, ratio_values, time_alive
 from oat_gym.ope._fqe_fits import is_tabular
 from oat_gym.ope._q_data import QData
 from oat_gym.ope._q_function import value_scale
+from oat_gym.ope._q_tabular import MAX_UNSUPPORTED, UNSUPPORTED
 from oat_gym.ope.estimator import Diagnostics, Estimates, Estimator
 from oat_gym.ope.problem import Problem
 
@@ -37,8 +38,6 @@ MIN_EFFECTIVE = 10.0
 """Effective numbers of steps under this are warned of."""
 MAX_LATE_CHANGE = 0.05
 """Largest change over the second half of the updates, of the value or of a twentieth of the rewards' range."""
-MAX_UNSUPPORTED = 0.01
-"""Largest probability of coming to pairs that the data does not hold that passes without a warning."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +70,12 @@ class DICE(Estimator):
       rotation around a saddle point.
     - "tabular": discrete states and actions. The flow equations of the empirical model, solved exactly: all presets
       agree. With a horizon zeta(s, a) is of all H steps together, and data beyond it helps to estimate the model.
+      Pairs that the data does not hold are treated as in tabular `FQE`.
     - "auto": tabular where that is possible, else network.
 
-    The ratios are to the training steps. The steps that are averaged are those of the part "weights": if synthetic
-    episodes, used for training only, change the distribution of steps, `mean_ratio` is off 1 and the value is biased;
-    `use_augmented="all"` averages what was trained on.
+    The ratios are to the steps that they are trained on, and those steps are averaged: both are the part "training" of
+    `use_augmented`, and "weights" has no meaning here. (Ratios to real and synthetic steps together, averaged over the
+    real ones, would be biased wherever the synthetic ones are distributed in another way.)
 
     Intervals resample the source episodes with zeta held fixed, which hides the error of training (diagnostic
     `interval_covers_training` is 0).
@@ -197,12 +197,12 @@ class DICE(Estimator):
         return found
 
     def _tabular(self, problem: Problem) -> Estimates:
-        rows, flat = problem.rows("weights"), problem.data.flat_observations
+        data, flat = QData.of(problem), problem.data.flat_observations
         table = problem.policy_probabilities(flat.unflatten(np.eye(flat.layout.width)))
         if table is None:
             raise ConfigurationError("approximation='tabular' needs policies with `probabilities`.")
-        ratios = tabular_ratios(problem, QData.of(problem), table, rows)
-        values, replicates = ratio_values(problem, ratios.zeta, rows, mass=ratios.mass)
+        ratios = tabular_ratios(problem, data, table)
+        values, replicates = ratio_values(problem, ratios.zeta, data.rows, mass=ratios.mass)
         values, replicates = (np.where(ratios.mass[:, None] > 0, x, 0.0) for x in (values[:, None], replicates))
         extra = [
             {"time_alive": float(m), "unsupported_mass": float(u)}
@@ -211,7 +211,7 @@ class DICE(Estimator):
         return Estimates(values[:, 0], replicates, _merged(ratio_diagnostics(ratios.zeta), extra))
 
     def _network(self, problem: Problem, seeds: Sequence[int]) -> tuple[Estimates, ...]:
-        rows = counted(problem, problem.rows("weights"))
+        rows = counted(problem, problem.rows("training"))
         objective = Objective(
             primal=self.primal,
             dual=self.dual,
@@ -251,7 +251,7 @@ def _merged(ratios: list[Diagnostics], extra: Sequence[Diagnostics]) -> tuple[Di
 
 def _warn(problem: Problem, found: Sequence[Estimates], name: str) -> None:
     """Warn of values that are not to be trusted, one warning for each reason."""
-    rewards = problem.data.steps.rewards[problem.rows("weights")]
+    rewards = problem.data.steps.rewards[problem.rows("training")]
     width, reasons = float(np.ptp(rewards)), dict[str, set[str]]()
 
     def note(reason: str, policy: str) -> None:
@@ -261,7 +261,7 @@ def _warn(problem: Problem, found: Sequence[Estimates], name: str) -> None:
         for policy, value, own in zip(problem.policies.names, estimates.values, estimates.diagnostics, strict=True):
             least = width * own["time_alive"] / 20
             if own.get("unsupported_mass", 0.0) > MAX_UNSUPPORTED:
-                note("does what the data does not hold (unsupported_mass), which counts as 0", policy)
+                note(UNSUPPORTED, policy)
             if abs(own.get("late_change", 0.0)) > MAX_LATE_CHANGE * max(abs(value), least) > 0:
                 note("still changed in the second half of the updates (late_change): give more updates", policy)
             if own["effective_sample_size"] < MIN_EFFECTIVE:

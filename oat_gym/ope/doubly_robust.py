@@ -13,7 +13,7 @@ import numpy.typing as npt
 from oat_gym._rng import derive
 from oat_gym.episodes import IntArray
 from oat_gym.errors import ConfigurationError, EstimationWarning
-from oat_gym.ope._magic import blend_weights, partial_lengths, step_shares
+from oat_gym.ope._magic import bias_interval, blend_weights, partial_lengths, step_shares
 from oat_gym.ope._normalised import Spans, discounts, normalised_sums
 from oat_gym.ope._q_function import FittedQ, QFunction, action_choices, expected_q
 from oat_gym.ope._weights import Clip, ImportanceWeights, importance_weights
@@ -40,11 +40,11 @@ class DoublyRobust(Estimator):
       its last weight. Biased for few episodes, consistent, of much less variance.
     - "magic": blends the partial sums of "wdr" (no step corrected, ..., all of them) by their estimated mean squared
       error (the same paper): trusts Q where the weights say little. The bias of each is measured to the
-      50% bootstrap interval of "wdr".
+      90% percentile interval of "wdr", widened to hold "wdr" itself.
 
     Q is fitted to the same episodes, so that its errors on them, and the correction, are smaller than on new ones.
-    Replicates resample episodes with Q (and the blend) held. The first term is over the problem's initial states, the
-    correction over the logged episodes.
+    Replicates resample episodes with Q (and the blend) held, whatever the fit's own `bootstrap` is: the interval does
+    not cover its training. The first term is over the problem's initial states, the correction over logged episodes.
 
     Args:
         kind: see above.
@@ -126,7 +126,9 @@ class DoublyRobust(Estimator):
         _warn_of_size(problem, self.name, diagnostics)
         corrections = np.array([value for value, _, _ in results])
         replicates = start @ problem.initial_weights().T + np.stack([parts for _, parts, _ in results])
-        fitted: Sequence[Diagnostics] = ({},) * len(start) if fit is None else fit.diagnostics
+        fitted: Sequence[Diagnostics] = ({},) * len(start)
+        if fit is not None:
+            fitted = [{**own, "interval_covers_training": 0.0} for own in fit.diagnostics]
         merged = [
             {**own, **of_weights, "correction": value, **more}
             for own, of_weights, (value, _, more) in zip(fitted, diagnostics, results, strict=True)
@@ -152,11 +154,11 @@ class DoublyRobust(Estimator):
         value, replicates = normalised_sums(logs, errors, final, spans, gamma=problem.gamma, counts=counts)
         if self.kind == "wdr":
             return value, replicates, {}
-        interval = np.quantile(start.mean() + replicates, (0.25, 0.75))
+        interval = bias_interval(start.mean() + value, start.mean() + replicates)
         weighted = normalised_errors(errors, (logs, final), spans)
         weighted *= discounts(problem.gamma, weighted.shape[1])
         first = _by_episode(problem, start, spans)
-        shares = magic_shares(weighted, first, (interval[0], interval[1]), count=self.partial_sums)
+        shares = magic_shares(weighted, first, interval, count=self.partial_sums)
         kept = errors * shares[np.minimum(problem.data.steps.step, len(shares) - 1)]
         value, replicates = normalised_sums(logs, kept, final, spans, gamma=problem.gamma, counts=counts)
         return value, replicates, {"uncorrected_share": 1.0 - float(shares[0])}

@@ -69,10 +69,10 @@ def evaluate(
         behavior: the policy that recorded the data: "clone" (fitted to it; or an `ope.BehaviorCloning` with
             settings), "logged" (`infos["log_prob"]`), or a `Policy`.
         initial_states: (M, ...) a batch of observations to start from; the data's own by default.
-        use_augmented: what synthetic episodes are used for. None, the default: "training" only (value functions and
-            models), so that weights and initial states are real. "all": everywhere, as in the paper. "none". A tuple
-            out of "training", "weights", "initial" and "behavior". Or a mapping from names or families of estimators
-            to those.
+        use_augmented: what synthetic episodes are used for. None, the default: "training" only (value functions,
+            models and DICE's ratios), so that importance weights and initial states are real. "all": everywhere, as in
+            the paper. "none". A tuple out of "training", "weights", "initial" and "behavior". Or a mapping from names
+            or families of estimators to those.
         paired: evaluate with and without the synthetic episodes, with the same seeds and resamples; the rows then say
             "data", and `Result.differences` has the difference with its interval.
         interval: "bootstrap" (over real source episodes, augmented copies following theirs), "percentile" or "normal";
@@ -83,7 +83,10 @@ def evaluate(
         progress: a callback (description, done, total), or whether to draw a bar (None: at a terminal).
 
     Returns:
-        The table, `Result.rows`: policy, estimator, seed, value, standard_error, low, high, diagnostics.
+        The table, `Result.rows`: policy, estimator, seed, value, standard_error, low, high, diagnostics. The intervals
+        of estimators that train hold fixed what was trained, unless they are told otherwise
+        (`FQE(ensemble=10, bootstrap=True)`, `ModelBased(bootstrap=True)`): the diagnostic `interval_covers_training` is
+        then 0, and `Result.table` marks them with a star.
 
     Raises:
         ConfigurationError: for settings that cannot work; before any work.

@@ -14,12 +14,11 @@ from oat_gym.ope._fqe_fits import NEEDS_TABLES, NetworkForm, fit_linear, fit_net
 from oat_gym.ope._fqe_training import Settings
 from oat_gym.ope._q_data import QData, RewardScale
 from oat_gym.ope._q_function import FittedQ, value_scale
+from oat_gym.ope._q_tabular import MAX_UNSUPPORTED, UNSUPPORTED
 from oat_gym.ope.estimator import Diagnostics, Estimates, Estimator
 from oat_gym.ope.problem import Problem
 
 Approximation = Literal["auto", "network", "tabular", "linear"]
-MAX_UNSUPPORTED = 0.01
-"""Largest probability of coming to pairs that the data does not hold that passes without a warning."""
 MAX_CLIPPED = 0.1
 """Largest share of clipped targets that passes without a warning."""
 MAX_LATE_CHANGE = 0.05
@@ -42,8 +41,9 @@ class FQE(Estimator):
       horizon). With a horizon h is one more input, drawn uniformly from 1..H for each row of a minibatch; its target
       is (r + gamma c_{h-1} u_{h-1}) / c_h, of one size for all h. Targets are clipped to what the data's rewards
       allow. The target network follows by `tau` at each update and gives the estimate.
-    - "tabular": discrete states and actions. The exact solution for the empirical model; a pair that the data does not
-      hold counts as 0.
+    - "tabular": discrete states and actions. The exact solution for the empirical model. In a state where the data
+      does not hold all that a policy does, the policy is kept to the actions that it holds, their probabilities scaled
+      up; where it holds none of them, the policy acts there as the data does (`unsupported_mass` says how often).
     - "linear": LSTD-Q in closed form on features of (s, a) (`degree`), with a block for each discrete action; with
       a horizon one least-squares fit for each h.
     - "auto": tabular where that is possible, else network.
@@ -222,7 +222,7 @@ def _reasons(
     """Return what speaks against a value."""
     (low, high), found = bounds, list[str]()
     if numbers.get("unsupported_mass", 0.0) > MAX_UNSUPPORTED:
-        found.append("does what the data does not hold (unsupported_mass), which counts as 0")
+        found.append(UNSUPPORTED)
     if "late_change" in numbers:
         # The value comes nearer by 1/e in about (sum of discounts) / tau updates, each backup taking 1 / tau.
         ahead = max(1.0, 10 * value_scale(problem) / (fqe.tau * fqe.updates))

@@ -20,6 +20,7 @@ from oat_gym.ope._model_ensemble import EnsembleModel, fit_ensemble
 from oat_gym.ope._model_rollout import DynamicsModel, GivenModel, Limits, RollOuts, roll_out
 from oat_gym.ope._model_training import Fitting
 from oat_gym.ope._q_function import value_scale
+from oat_gym.ope._q_tabular import MAX_UNSUPPORTED, UNSUPPORTED
 from oat_gym.ope.estimator import Diagnostics, Estimates, Estimator
 from oat_gym.ope.problem import Problem
 
@@ -33,8 +34,6 @@ MAX_CLIPPED = 0.25
 """Largest share of steps that leave the data's range without a warning."""
 MAX_CUT = 0.01
 """Largest bound of what cut roll-outs miss, in parts of the bound of values, without a warning."""
-MAX_UNSUPPORTED = 0.01
-"""Largest probability of coming to pairs that the data does not hold that passes without a warning."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class ModelBased(Estimator):
       distributions), each given (s, a) and the variables before it, and drawn one after another; reward (its mean) and
       continuation are given (s, a, s'). One network for each variable.
     - "tabular": discrete states and actions. The empirical model, solved exactly: the values that a model of counts
-      gives by roll-outs without end, and those of tabular FQE. A pair that the data does not hold counts as 0.
+      gives by roll-outs without end, and those of tabular FQE, with its rule for pairs that the data does not hold.
     - "auto": tabular where that is possible, else ensemble.
 
     A roll-out takes the horizon's steps. Without one it ends when gamma^t times the probability of being alive is
@@ -285,7 +284,7 @@ def _warn(problem: Problem, found: Sequence[Estimates], name: str) -> None:
     for estimates in found:
         for policy, own in zip(problem.policies.names, estimates.diagnostics, strict=True):
             if own.get("unsupported_mass", 0.0) > MAX_UNSUPPORTED:
-                note("does what the data does not hold (unsupported_mass), which counts as 0", policy)
+                note(UNSUPPORTED, policy)
             if max(own.get("held_out_state_error", 0.0), own.get("held_out_reward_error", 0.0)) > MAX_ERROR:
                 note("comes from a model that predicts held-out steps hardly better than a constant", policy)
             if own.get("share_clipped", 0.0) > MAX_CLIPPED:

@@ -182,8 +182,13 @@ class _Alone:
 
 
 def streams(rng: np.random.Generator, count: int) -> list[np.random.Generator]:
-    """Return the generators that the policies of a set draw from: the first ones are the same for any `count`."""
-    return [np.random.default_rng(int(seed)) for seed in rng.integers(0, 2**63 - 1, size=count)]
+    """Return the generators that the policies of a set draw from, all in one state.
+
+    What a policy draws then depends neither on its place in the set nor on the others, and the random numbers that
+    policies have in common cancel in the differences between their values.
+    """
+    seed = int(rng.integers(0, 2**63 - 1))
+    return [np.random.default_rng(seed) for _ in range(count)]
 
 
 def _stacked(policies: list[Policy]) -> PolicyStack:

@@ -19,6 +19,10 @@ Row = dict[str, Any]
 Data = Literal["real", "augmented"]
 Key = tuple[str, str, int, Data]
 """Policy, estimator, seed, data."""
+_PARTIAL = (
+    "* Resamples do not reach what was fitted: this interval leaves out the error of training on another sample.\n"
+    "  Closed forms and ensembles have intervals with it: FQE(ensemble=10, bootstrap=True), ModelBased(bootstrap=True)."
+)
 _COLUMNS = ("policy", "estimator", "seed", "data", "value", "difference", "standard_error", "low", "high")
 
 
@@ -97,6 +101,9 @@ class Result:
         Replicates are averaged over the seeds too, which gives the error from the data; `seed_spread` is the standard
         deviation of the values over the S seeds, and spread / sqrt(S) the error from training. `standard_error` is the
         root of the sum of their squares, and the interval is widened alike (Student's t of S - 1 degrees of freedom).
+        `covers_training` is False where the replicates hold fixed what was fitted (`interval_covers_training` of the
+        diagnostics): the interval then has the randomness of training (with two seeds or more), but not what a fit to
+        another sample would give.
         """
         groups: dict[tuple[str, str, str], list[Row]] = {}
         for row in self.rows:
@@ -117,7 +124,8 @@ class Result:
             high = value + math.hypot(max(high - value, 0.0), margin)
         head = {key: members[0][key] for key in ("policy", "estimator", "data") if key in members[0]}
         tail = {"standard_error": math.hypot(error, seed_error), "low": low, "high": high}
-        return head | {"seeds": n, "value": value, "seed_spread": spread} | tail
+        covers = {"covers_training": all(_covers(row) for row in members)}
+        return head | {"seeds": n, "value": value, "seed_spread": spread} | tail | covers
 
     def compare(self, truth: Any, *, convention: metrics.Convention = "dope") -> list[Row]:
         """Return MAE, rank correlation and regrets of each estimator and seed (`ope.metrics.summary`).
@@ -163,11 +171,15 @@ class Result:
         return rows
 
     def table(self) -> str:
-        """Return the rows as text, one a line."""
+        """Return the rows as text, one a line; a star marks intervals that leave out the error of training."""
         names = [name for name in _COLUMNS if any(name in row for row in self.rows)]
         cells = [names, *([_cell(row.get(name)) for name in names] for row in self.rows)]
+        partial = [not _covers(row) for row in self.rows]
+        for line, marked in zip(cells[1:], partial, strict=True):
+            line[-1] += "*" * marked
         widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
-        return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells)
+        lines = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells]
+        return "\n".join(lines + [_PARTIAL] * any(partial))
 
     def to_frame(self) -> Any:
         """Return the rows as a `pandas.DataFrame`, a column for each diagnostic ("diagnostics.NAME").
@@ -202,6 +214,11 @@ def spread(value: float, draws: FloatArray, question: Question) -> tuple[float, 
         draws, n=question.n_units, confidence=question.confidence, method=question.interval, values=value
     )
     return float(standard_error(draws)), float(low), float(high)
+
+
+def _covers(row: Row) -> bool:
+    """Return whether resamples reach all that a row's estimate depends on, as far as the estimator says."""
+    return bool(row["diagnostics"].get("interval_covers_training", 1.0))
 
 
 def _cell(value: Any) -> str:

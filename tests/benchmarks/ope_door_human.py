@@ -36,7 +36,7 @@ GAMMA, HORIZON, TASK = 0.995, 200, "door"
 CLIP = (-6.0, 2.0)
 CENSORED = ope.BehaviorCloning(density="censored")
 _KINDS: tuple[Literal["per-decision", "trajectory"], ...] = ("per-decision", "trajectory")
-_FORMS: tuple[Literal["dr", "wdr", "magic"], ...] = ("wdr", "magic", "dr")
+_FORMS: tuple[Literal["dr", "wdr"], ...] = ("wdr", "dr")
 
 CELLS: dict[str, tuple[tuple[ope.Estimator, ...], int | None, str, str]] = {
     # name: estimators, horizon, initial states, densities of behaviour and target policies
@@ -171,7 +171,10 @@ def tables(out: Path) -> None:
     true = truth()
     cells = [json.loads(path.read_text()) for path in sorted(out.glob("*.json"))]
     groups: dict[tuple[str, str], list[dict]] = {}
+    known = {(name, estimator.name) for name, cell in CELLS.items() for estimator in cell[0]}
     for name, row in ((cell["cell"], row) for cell in cells for row in cell["rows"]):
+        if (name, row["estimator"]) not in known:
+            continue
         groups.setdefault((name, row["estimator"]), []).append(row)
     setting = {cell["cell"]: {k: cell[k] for k in ("horizon", "initial", "density")} for cell in cells}
     order = sorted(groups, key=lambda key: list(CELLS).index(key[0]))

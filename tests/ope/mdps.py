@@ -212,6 +212,8 @@ def sample_logs(
     states[:, 0] = draw(np.broadcast_to(mdp.initial, (n, mdp.n_states)), rng)
     lengths, ended = limits.copy(), np.zeros(n, dtype=bool)
     for t in range(total):
+        if (ended | (t >= limits)).all():
+            break
         now = states[:, t]
         actions[:, t] = draw(policy[now], rng)
         states[:, t + 1] = draw(mdp.transitions[now, actions[:, t]], rng)

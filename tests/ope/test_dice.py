@@ -63,9 +63,8 @@ def test_the_restarted_process_has_the_alive_occupancy(gamma: float) -> None:
 @pytest.mark.parametrize("horizon", [None, 8])
 def test_ratios_average_one_and_are_those_of_the_occupancies(horizon: int | None) -> None:
     problem, mdp = make_problem(4000, horizon=horizon), mdps.random_mdp(seed=3)
-    rows = problem.rows("weights")
     table = np.stack([mdps.random_policy(mdp, seed=s) for s in (1, 2)])
-    ratios = tabular_ratios(problem, QData.of(problem), table, rows)
+    ratios = tabular_ratios(problem, QData.of(problem), table)
     np.testing.assert_allclose(ratios.zeta.mean(axis=1), 1.0)
     steps = problem.data.steps
     logged = np.zeros((mdp.n_states, mdp.n_actions))
@@ -88,9 +87,9 @@ def test_tables_give_the_value_of_the_empirical_process(gamma: float, horizon: i
 def test_on_policy_replicates_are_weighted_means_with_the_ratios_fixed() -> None:
     problem = make_problem(200, horizon=5)
     estimates = DICE().estimate(problem, seeds=(0,))[0]
-    rows, mdp = problem.rows("weights"), mdps.random_mdp(seed=3)
+    mdp = mdps.random_mdp(seed=3)
     table = np.stack([mdps.random_policy(mdp, seed=s) for s in (1, 2)])
-    ratios = tabular_ratios(problem, QData.of(problem), table, rows)
+    ratios = tabular_ratios(problem, QData.of(problem), table)
     weights = ratios.zeta * problem.resamples[7][problem.data.steps.episode]
     expected = ratios.mass * (weights @ problem.data.steps.rewards) / weights.sum(axis=1)
     np.testing.assert_allclose(estimates.replicates[:, 7], expected)
@@ -110,7 +109,40 @@ def test_what_the_data_lacks_is_reported() -> None:
     assert mass[0] == 0.0
     assert mass[1] == pytest.approx(1.0)
     assert 0.5 < mass[2] < 1.0
-    assert estimates.values[1] == 0.0
+    np.testing.assert_allclose(estimates.values, estimates.values[0])  # kept to the one action that was ever taken
+
+
+def with_other_copies(problem: Problem) -> Problem:
+    """Add synthetic copies of the long episodes only, which change the distribution of steps."""
+    data, steps = problem.data, problem.data.steps
+    chosen = np.flatnonzero(data.lengths > 5)
+    rows = data.rows_of(data.lengths > 5)
+    names = ("observations", "actions", "rewards", "next_observations", "terminated", "truncated", "step")
+    columns = {name: np.concatenate((getattr(steps, name), getattr(steps, name)[rows])) for name in names}
+    number = np.repeat(len(data) + np.arange(len(chosen)), data.lengths[chosen])
+    lengths = np.concatenate((data.lengths, data.lengths[chosen]))
+    columns |= {"episode": np.concatenate((steps.episode, number))}
+    columns |= {"synthetic": np.arange(len(steps) + len(rows)) >= len(steps)}
+    synthetic, unit = np.arange(len(lengths)) >= len(data), np.concatenate((data.unit, data.unit[chosen]))
+    offsets = np.concatenate(([0], np.cumsum(lengths)))
+    logged = replace(data, steps=replace(steps, **columns), unit=unit, synthetic=synthetic, offsets=offsets)
+    return replace(problem, data=logged)
+
+
+@pytest.mark.parametrize("config", [DICE(), TINY], ids=["tabular", "network"])
+def test_steps_are_averaged_where_the_ratios_were_trained(config: DICE) -> None:
+    # the process of the copies is the real one, and only the distribution of steps another: values stay right
+    problem = with_other_copies(make_problem(400, horizon=6))
+    exact = DICE().estimate(replace(problem, use_augmented=frozenset()), seeds=(0,))[0]
+    found = []
+    for parts in (frozenset({"training"}), frozenset({"training", "weights"})):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", EstimationWarning)
+            found.append(config.estimate(replace(problem, use_augmented=parts), seeds=(0,))[0])
+    np.testing.assert_array_equal(found[0].values, found[1].values)
+    if config == DICE():
+        np.testing.assert_allclose(found[0].values, exact.values, atol=0.2)
+        assert [own["mean_ratio"] for own in found[0].diagnostics] == pytest.approx([1.0, 1.0])
 
 
 # --- networks --------------------------------------------------------------------------------------------------------

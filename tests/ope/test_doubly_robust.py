@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.optimize import minimize
 
 from oat_gym.errors import ConfigurationError, EstimationWarning
 from oat_gym.ope import FQE, DoublyRobust, ImportanceSampling
-from oat_gym.ope._magic import blend_weights, partial_lengths, simplex_minimum, step_shares
+from oat_gym.ope._magic import bias_interval, blend_weights, partial_lengths, simplex_minimum, step_shares
 from oat_gym.ope._normalised import Spans
 from oat_gym.ope._weights import importance_weights
 from oat_gym.ope.doubly_robust import normalised_errors, td_errors, weighted_terms
@@ -173,6 +174,66 @@ def test_magic_trusts_action_values_where_weights_vary_and_distrusts_wrong_ones(
     np.testing.assert_array_equal(partial_lengths(100, 3), [0, 50, 100])
     shares = step_shares(np.array([0.5, 0.3, 0.2]), np.array([0, 1, 3]), 3)
     np.testing.assert_allclose(shares, [0.5, 0.2, 0.2])
+
+
+def test_biases_are_measured_to_the_90_percent_interval() -> None:
+    replicates = np.random.default_rng(0).permutation(np.arange(1001.0))
+    assert bias_interval(500.0, replicates) == pytest.approx((50.0, 950.0))
+    assert bias_interval(20.0, replicates) == pytest.approx((20.0, 950.0))  # it holds the estimate itself
+    assert bias_interval(1.0, np.array([np.nan])) == (1.0, 1.0)
+
+
+def test_magic_follows_its_definition() -> None:
+    # g_j by loops over steps, their covariance and bias, and the blend of least error by another solver
+    mdp, n = mdps.random_mdp(seed=3), 40
+    problem, policies = setting(mdp, n, horizon=6)
+    table = np.random.default_rng(1).normal(size=(2, 7, mdp.n_states, mdp.n_actions)) * 0.5
+    table[:, 0] = 0.0
+    with quiet():
+        got = DoublyRobust(kind="magic", q=Known(table)).estimate(problem, seeds=(0,))[0]
+        full = DoublyRobust(kind="wdr", q=Known(table)).estimate(problem, seeds=(0,))[0]
+    steps, offsets = problem.data.steps, problem.data.offsets
+    ratios = np.exp(problem.target_log_prob() - problem.behavior(0))
+    for p, policy in enumerate(policies):
+        v = (policy * table[p]).sum(axis=2)
+        parts = np.zeros((n, 7))
+        parts[:, 0] = v[6, problem.initial] / n
+        rho = np.ones((n, 6))
+        for i in range(n):
+            own = np.cumprod(ratios[p, offsets[i] : min(offsets[i + 1], offsets[i] + 6)])
+            rho[i, : len(own)], rho[i, len(own) :] = own, own[-1]
+        w = rho / rho.sum(axis=0)
+        for i in range(n):
+            for t, row in enumerate(range(offsets[i], min(offsets[i + 1], offsets[i] + 6))):
+                after = 0.0 if steps.terminated[row] else v[5 - t, steps.next_observations[row]]
+                own = table[p, 6 - t, steps.observations[row], steps.actions[row]]
+                parts[i, t + 1] = 0.9**t * w[i, t] * (steps.rewards[row] + 0.9 * after - own)
+        partial = parts.cumsum(axis=1)
+        g, omega = partial.sum(axis=0), np.cov(partial.T) * n
+        assert g[-1] == pytest.approx(full.values[p])
+        low, high = (np.quantile(full_replicates(problem, table, p, full), q) for q in (0.05, 0.95))
+        bias = np.maximum(min(low, g[-1]) - g, 0) + np.maximum(g - max(high, g[-1]), 0)
+        error = omega + np.outer(bias, bias)
+        found = minimize(
+            lambda x, a=error: x @ a @ x * 1e3,
+            np.full(7, 1 / 7),
+            bounds=[(0, 1)] * 7,
+            constraints={"type": "eq", "fun": lambda x: x.sum() - 1},
+            options={"ftol": 1e-14, "maxiter": 500},
+        )
+        assert got.values[p] == pytest.approx(found.x @ g, abs=2e-3)
+
+
+def full_replicates(problem, table: FloatArray, p: int, full) -> FloatArray:
+    """Return replicates of the weighted estimate with the mean of V(s_0) held: what the bias is measured to."""
+    start = (problem.policies.policies[p].table * table[p, -1]).sum(axis=1)[problem.initial]
+    return full.replicates[p] - problem.initial_weights() @ start + start.mean()
+
+
+def test_intervals_hold_the_action_values_fixed() -> None:
+    problem, _ = setting(mdps.random_mdp(seed=3), 100)
+    fitted = DoublyRobust(q=FQE(bootstrap=True)).estimate(problem, seeds=(0,))[0]
+    assert [numbers["interval_covers_training"] for numbers in fitted.diagnostics] == [0.0, 0.0]
 
 
 def test_magic_is_the_blend_of_partial_sums() -> None:

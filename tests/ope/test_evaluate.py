@@ -14,7 +14,7 @@ from minari import EpisodeData
 
 from oat_gym import AugmentedDataset, Function, ope
 from oat_gym.episodes import content_hash
-from oat_gym.errors import ConfigurationError, ConformanceError, EstimationWarning
+from oat_gym.errors import ConfigurationError, ConformanceError, EstimationWarning, InvalidDataError
 from oat_gym.ope import Estimates, Estimator, ImportanceSampling, Problem, evaluate
 from tests.conftest import install_dataset
 
@@ -214,6 +214,37 @@ def test_tables_for_people_and_for_pandas(real: minari.MinariDataset) -> None:
     frame = result.to_frame()
     assert list(frame["policy"]) == list(POLICIES)
     assert (frame["diagnostics.effective_sample_size"] > 10).all()
+
+
+def test_intervals_that_leave_out_training_are_marked(real: minari.MinariDataset) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EstimationWarning)  # every episode starts in one state
+        result = ask(real, [IS, ope.FQE(), ope.FQE(bootstrap=True)])
+    lines = [line for line in result.table().splitlines() if line.startswith("left")]
+    assert [line.endswith("*") for line in lines] == [False, True, False]
+    assert "FQE(ensemble=10, bootstrap=True)" in result.table()
+    assert "*" not in ask(real).table()
+    covers = {row["estimator"]: row["covers_training"] for row in result.over_seeds()}
+    assert covers == {IS.name: True, "FQE": False, "FQE bootstrap": True}
+
+
+def test_a_behaviour_policy_that_rules_out_a_logged_action_is_refused(real: minari.MinariDataset) -> None:
+    never = mdps.Table(np.tile([1.0, 0.0], (4, 1)))
+    with pytest.raises(InvalidDataError, match="it cannot have recorded the data"):
+        ask(real, behavior=never)
+
+    def other(episode: EpisodeData, rng: np.random.Generator) -> EpisodeData:
+        episode.actions[:] = 0
+        return episode
+
+    # an action that was generated may be impossible, as long as it is not weighted
+    sure = mdps.sample_logs(CHAIN, np.tile([0.0, 1.0], (4, 1)), 20, 300, np.random.default_rng(0))
+    base = install_dataset("test/sure-v0", mdps.buffers(sure), spaces.Discrete(4), spaces.Discrete(2))
+    data, known = AugmentedDataset(base, Function(other), count=5, seed=0), mdps.Table(np.tile([0.0, 1.0], (4, 1)))
+    rows = evaluate(data, known, IS, gamma=GAMMA, seeds=1, behavior=known, resamples=20).rows
+    assert rows[0]["value"] == pytest.approx(sure.returns(GAMMA).mean())
+    with pytest.raises(InvalidDataError, match=r"episode 2\d the log-probability -inf"):
+        evaluate(data, known, IS, gamma=GAMMA, seeds=1, behavior=known, resamples=20, use_augmented="all")
 
 
 def test_warnings_reach_the_user_and_the_rows(real: minari.MinariDataset) -> None:

@@ -179,6 +179,16 @@ def test_clipping_bounds_each_ratio_and_is_counted() -> None:
     assert [d["share_clipped"] for d in got.diagnostics] == [1.0, 0.0]
 
 
+def test_episodes_that_are_not_weighted_have_the_ratio_one() -> None:
+    problem = chain_problem(12, policies=(RIGHT,))
+    data = dataclasses.replace(problem.data, synthetic=np.arange(12) >= 8)
+    impossible = np.where(data.synthetic[data.steps.episode], -np.inf, problem.behavior(0))
+    problem = dataclasses.replace(problem, data=data, behavior=lambda seed: impossible)
+    weights = importance_weights(problem, 0, log_ratio_clip=(-0.1, 0.1))
+    assert (weights.log_ratio[:, data.synthetic[data.steps.episode]] == 0).all()
+    assert weights.share_clipped[0] == 1.0  # of the steps that count
+
+
 def test_weights_are_cumulated_within_episodes_and_kept_at_the_horizon() -> None:
     problem = chain_problem(20, seed=4, length=25, horizon=6)
     weights = importance_weights(problem, 0)
