@@ -16,12 +16,18 @@ def embedded_path(dataset_id: str) -> Path:
     Raises:
         DatasetNotFoundError: if the installation lacks it.
     """
-    folder = EMBEDDED[dataset_id]
+    return embedded_file(f"{EMBEDDED[dataset_id]}/data")
+
+
+def embedded_file(relative: str) -> Path:
+    """Return a file or folder of `datasets/` (as "truth/adroit-door.json"): in the installed package, or a checkout.
+
+    Raises:
+        DatasetNotFoundError: if the installation lacks it.
+    """
     package = Path(__file__).parent
-    places = (package / "_data" / folder / "data", package.parent / "datasets" / folder / "data")
+    places = (package / "_data" / relative, package.parent / "datasets" / relative)
     for place in places:
-        if place.is_dir():
+        if place.exists():
             return place
-    raise DatasetNotFoundError(
-        f"The embedded dataset {dataset_id!r} is missing from this installation ({places[0]}): reinstall oat-gym."
-    )
+    raise DatasetNotFoundError(f"{relative} is missing from this installation ({places[0]}): reinstall oat-gym.")

@@ -1,4 +1,4 @@
-"""The paper's domains: datasets by name.
+"""The paper's domains: datasets, target policies and true values by name.
 
 >>> from oat_gym import domains
 >>> domains.load("maze2d-umaze").total_episodes
@@ -10,14 +10,25 @@ from collections.abc import Callable
 import minari
 
 from oat_gym.domains import adroit, maze2d, tutoring
+from oat_gym.domains.task import Task
+from oat_gym.domains.truth import Truth
 from oat_gym.errors import ConfigurationError
+from oat_gym.ope.policy import Policy
+from oat_gym.spaces import Batch
 
 DATASETS: dict[str, Callable[[], minari.MinariDataset]] = {
-    "maze2d-umaze": maze2d.umaze,
-    "adroit-door-human": adroit.door_human,
-    "tutoring-smartprimer": tutoring.smartprimer,
+    **maze2d.DATASETS,
+    **adroit.DATASETS,
+    **tutoring.DATASETS,
 }
 """Name of each dataset and the function that opens it."""
+
+TASKS: dict[str, Task] = {
+    **maze2d.TASKS,
+    **adroit.TASKS,
+    **tutoring.TASKS,
+}
+"""Name of each task and what its datasets are evaluated with."""
 
 
 def load(name: str) -> minari.MinariDataset:
@@ -32,4 +43,66 @@ def load(name: str) -> minari.MinariDataset:
     return DATASETS[name]()
 
 
-__all__ = ["DATASETS", "adroit", "load", "maze2d", "tutoring"]
+def task(name: str) -> Task:
+    """Return the task of this name (one of `TASKS`), or the task that a dataset of this name belongs to.
+
+    Raises:
+        ConfigurationError: for an unknown name.
+    """
+    if name in TASKS:
+        return TASKS[name]
+    for candidate in TASKS.values():
+        if name in candidate.datasets:
+            return candidate
+    raise ConfigurationError(f"There is no task named {name!r}; the names are {', '.join(sorted(TASKS))}.")
+
+
+def policies(name: str) -> dict[str, Policy]:
+    """Return the target policies of a task, by name.
+
+    Raises:
+        ConfigurationError: for an unknown task.
+        DatasetNotFoundError: if the policies' weights are not on this machine; the message says how to get them.
+    """
+    return task(name).policies()
+
+
+def truth(name: str, gamma: float | None = None) -> Truth:
+    """Return the true values of a task's target policies, at a discount (`None`: the task's usual one).
+
+    Raises:
+        ConfigurationError: for an unknown task, one whose true values nobody knows, or a discount that is not stored.
+        DatasetNotFoundError: if what they are computed from is not on this machine.
+    """
+    found = task(name)
+    if found.truth is None:
+        raise ConfigurationError(f"Nobody knows the true values of {name!r}: its log is of real people.")
+    return found.truth(found.gamma if gamma is None else gamma)
+
+
+def initial_states(name: str, *, count: int = 200, seed: int = 0) -> Batch:
+    """Return observations where a task's environment starts episodes, `count` of them.
+
+    Raises:
+        ConfigurationError: for an unknown task, or one without an environment.
+    """
+    found = task(name)
+    if found.initial_states is None:
+        raise ConfigurationError(f"{name!r} has no environment to start episodes in; use its data's first states.")
+    return found.initial_states(count, seed)
+
+
+__all__ = [
+    "DATASETS",
+    "TASKS",
+    "Task",
+    "Truth",
+    "adroit",
+    "initial_states",
+    "load",
+    "maze2d",
+    "policies",
+    "task",
+    "truth",
+    "tutoring",
+]

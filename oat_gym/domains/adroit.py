@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +17,7 @@ from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
 from oat_gym.domains._data import converted, find_file
+from oat_gym.domains.task import Task
 from oat_gym.errors import InvalidDataError
 from oat_gym.io.writing import DatasetCard, dataset_from_episodes, episode_buffer
 
@@ -117,3 +119,10 @@ def _card() -> DatasetCard:
         eval_env_spec=spec,
         requirements=("gymnasium-robotics>=1.3",),
     )
+
+
+DATASETS: dict[str, Callable[[], minari.MinariDataset]] = {"adroit-door-human": door_human}
+"""Name of each dataset and the function that opens it."""
+
+TASKS: dict[str, Task] = {}
+"""Name of each task and what its datasets are evaluated with."""

@@ -8,12 +8,14 @@ The dataset is ours: way-points of a shortest path, followed by a noisy PD contr
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import minari
 import numpy as np
 import numpy.typing as npt
 
+from oat_gym.domains.task import Task
 from oat_gym.embedded import embedded_path
 from oat_gym.errors import ConfigurationError
 
@@ -121,3 +123,10 @@ def umaze() -> minari.MinariDataset:
     250
     """
     return minari.MinariDataset(embedded_path(DATASET_ID))
+
+
+DATASETS: dict[str, Callable[[], minari.MinariDataset]] = {"maze2d-umaze": umaze}
+"""Name of each dataset and the function that opens it."""
+
+TASKS: dict[str, Task] = {}
+"""Name of each task and what its datasets are evaluated with."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from oat_gym.domains._data import converted, find_file
+from oat_gym.domains.task import Task
 from oat_gym.errors import InvalidDataError
 from oat_gym.io.tables import episodes_from_table
 from oat_gym.io.writing import DatasetCard, dataset_from_episodes
@@ -131,3 +133,10 @@ def _taken_probability(table: dict[str, npt.NDArray[np.float64]], source: Path) 
     probabilities = np.stack([table[f"p_{name}"] for name in ACTIONS], axis=1)
     taken = probabilities[np.arange(len(action)), action]
     return np.maximum(taken, PROBABILITY_FLOOR)
+
+
+DATASETS: dict[str, Callable[[], minari.MinariDataset]] = {"tutoring-smartprimer": smartprimer}
+"""Name of each dataset and the function that opens it."""
+
+TASKS: dict[str, Task] = {}
+"""Name of each task and what its datasets are evaluated with."""

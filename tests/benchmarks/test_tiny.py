@@ -44,7 +44,7 @@ def test_a_tiny_cell_runs(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.skipif("OAT_GYM_D3RLPY_PYTHON" not in os.environ, reason="OAT_GYM_D3RLPY_PYTHON names no interpreter")
 def test_fqe_beside_d3rlpy(tmp_path: Path) -> None:
-    assert "d3rlpy" in run("bench_fqe.py", "--updates", "5", "--rounds", "1", folder=tmp_path)
+    assert '"peer"' in run("bench_fqe.py", "--updates", "5", "--rounds", "1", folder=tmp_path)
 
 
 def test_the_door_evidence(shared_data: Path, tmp_path: Path) -> None:
