@@ -5,12 +5,13 @@
 >>> len(data)
 2500
 
-Importing the package teaches Minari the data format "oat" (see `oat_gym.dataset.install`).
+Importing the package teaches Minari the data format "oat" (see `oat_gym.dataset.install`) and Gymnasium the simulators
+of `oat_gym.envs`.
 """
 
 import importlib.metadata
 
-from oat_gym import checks, domains, metrics, mining, ope
+from oat_gym import checks, domains, envs, metrics, mining, ope
 from oat_gym.augmenters import AUGMENTERS, Augmenter, Function
 from oat_gym.augmenters.compose import Compose
 from oat_gym.augmenters.dgw import DGW
@@ -36,6 +37,7 @@ from oat_gym.stitching import Span
 __version__ = importlib.metadata.version("oat-gym")
 
 install()
+envs.register()
 
 __all__ = [
     "AUGMENTERS",
@@ -65,6 +67,7 @@ __all__ = [
     "augment",
     "checks",
     "domains",
+    "envs",
     "metrics",
     "mining",
     "ope",
