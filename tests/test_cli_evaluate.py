@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from oat_gym import cli, ope
+from oat_gym import cli, domains, ope
+from oat_gym.domains.truth import exact_truth
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError, EstimationWarning, InvalidDataError
 
 
@@ -70,6 +71,32 @@ def test_augmented_episodes_are_paired_and_the_truth_is_compared(
         assert words in printed
 
 
+def test_a_dataset_of_no_task_needs_policies(walk_dataset: minari.MinariDataset) -> None:
+    with pytest.raises(ConfigurationError, match="no task named 'test/walks-v0'"):
+        evaluate()
+
+
+def test_the_policies_and_values_of_a_task(
+    walk_dataset: minari.MinariDataset, policies: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = ope.load_dope_policies(policies, action_space=walk_dataset.action_space)  # type: ignore[arg-type]
+    values = {"walk_0": 1.0, "walk_1": -1.0}
+    task = domains.Task(
+        datasets=("test/walks-v0",),
+        policies=lambda: {**known},
+        truth=lambda gamma: exact_truth(values, gamma=gamma, horizon=6, command="by hand"),
+        gamma=0.9,
+        horizon=6,
+    )
+    monkeypatch.setitem(domains.TASKS, "walks", task)
+    with pytest.warns(EstimationWarning):
+        by_dataset, by_name = evaluate(), evaluate("--policies", "walks")
+        shorter = evaluate("--horizon", "5")
+    assert by_dataset == by_name
+    assert "mae" in by_dataset
+    assert "mae" not in shorter, "values of 6 steps are no truth for 5"
+
+
 @pytest.mark.parametrize(
     "case",
     [
@@ -80,6 +107,7 @@ def test_augmented_episodes_are_paired_and_the_truth_is_compared(
         (["--gamma", "1.5", "--policies", "POLICIES"], ConfigurationError, "gamma must be"),
         (["--truth", "BAD"], InvalidDataError, "columns policy and value"),
         ([], DatasetNotFoundError, "no npz file"),
+        (["--policies", "adroit-nothing"], DatasetNotFoundError, "no npz file in adroit-nothing"),
     ],
 )
 def test_bad_input(

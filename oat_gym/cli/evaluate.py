@@ -13,7 +13,7 @@ from gymnasium import spaces
 from minari import MinariDataset
 from rich.table import Table
 
-from oat_gym import ope
+from oat_gym import domains, ope
 from oat_gym.augmenters import AUGMENTERS
 from oat_gym.cache import write_atomically
 from oat_gym.cli._shared import Dataset, Factor, Seed, find_augmenter, open_source, out
@@ -26,10 +26,13 @@ _PARTS: dict[str, ope.UseAugmented] = {"training": None, "all": "all", "none": "
 
 def evaluate(
     dataset: Dataset,
-    policies: Annotated[Path, typer.Option(help="Folder of policy weights (npz, as the DOPE benchmark's).")],
+    policies: Annotated[
+        str | None,
+        typer.Option(help="Folder of policy weights (npz, as DOPE's), or a task; else the task of DATASET."),
+    ] = None,
     estimators: Annotated[str, typer.Option(help=f"all, or some of {','.join(ope.ESTIMATORS)}.")] = "all",
-    gamma: Annotated[float, typer.Option(help="Discount.")] = 0.995,
-    horizon: Annotated[int | None, typer.Option(help="Steps whose rewards count; all without it.")] = None,
+    gamma: Annotated[float | None, typer.Option(help="Discount; else the task's, or 0.995.")] = None,
+    horizon: Annotated[int | None, typer.Option(help="Steps whose rewards count; else the task's, or all.")] = None,
     seeds: Annotated[int, typer.Option(help="How many seeds each estimator is run with.")] = 3,
     augmenter: Annotated[str, typer.Option(help=f"none, or one of {', '.join(AUGMENTERS)}.")] = "none",
     factor: Factor = 10,
@@ -44,24 +47,25 @@ def evaluate(
     """Estimate what each policy would earn, from the episodes of DATASET.
 
     With an augmenter (or a dataset that is augmented already) every estimate is made with and without the synthetic
-    episodes, and the change is shown.
+    episodes, and the change is shown. Estimates for a task's policies are compared with their true values, where these
+    are known.
     """
     chosen = _estimators(estimators)
     if use_augmented not in _PARTS:
         raise ConfigurationError(f"--use-augmented must be one of {', '.join(_PARTS)}, got {use_augmented!r}.")
     if behavior not in ("clone", "logged"):
         raise ConfigurationError(f"--behavior must be clone or logged, got {behavior!r}.")
-    known = None if truth is None else read_truth(truth)
+    given = None if truth is None else read_truth(truth)
     data = _data(dataset, augmenter, factor, seed)
-    space = data.action_space
-    if not isinstance(space, spaces.Box):
-        raise ConfigurationError(f"Policies from weight files act in a Box; the actions of {data.id!r} are {space}.")
+    targets, task = _targets(policies, dataset, data)
+    gamma = gamma or (task.gamma if task else 0.995)
+    horizon = horizon or (task.horizon if task else None)
     with progress_bar() as progress:
         if isinstance(data, AugmentedDataset):
             data.fit(progress=progress)
         result = ope.evaluate(
             data,
-            ope.load_dope_policies(policies, action_space=space),
+            targets,
             chosen,
             gamma=gamma,
             horizon=horizon,
@@ -78,6 +82,7 @@ def evaluate(
     if result.question.paired:
         out.print("Change by the synthetic episodes:")
         _print_rows(result.differences, ("policy", "estimator", "seed", "difference", "standard_error", "low", "high"))
+    known = given or (task.truth(gamma) if task and task.truth and horizon == task.horizon else None)
     if known is not None:
         _print_rows(
             result.compare(known),
@@ -130,6 +135,20 @@ def _estimators(names: str) -> list[ope.Estimator]:
         if name not in ope.ESTIMATORS:
             raise ConfigurationError(f"There is no estimator {name!r}; choose of {', '.join(ope.ESTIMATORS)}.")
     return [ope.ESTIMATORS[name]() for name in dict.fromkeys(chosen)]
+
+
+def _targets(
+    policies: str | None, dataset: str, data: MinariDataset
+) -> tuple[dict[str, ope.Policy], domains.Task | None]:
+    """Return the target policies, and the task that they are of."""
+    if policies is None or policies in domains.TASKS:
+        task = domains.task(dataset if policies is None else policies)
+        return task.policies(), task
+    if not isinstance(data.action_space, spaces.Box):
+        raise ConfigurationError(
+            f"Policies from weight files act in a Box; the actions of {data.id!r} are {data.action_space}."
+        )
+    return {**ope.load_dope_policies(policies, action_space=data.action_space)}, None
 
 
 def _data(dataset: str, augmenter: str, factor: float, seed: int) -> MinariDataset:

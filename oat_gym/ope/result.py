@@ -135,15 +135,16 @@ class Result:
             convention: of the regrets.
 
         Raises:
-            ConfigurationError: where the truth is of another discount.
+            ConfigurationError: where the truth is of another discount or horizon.
             InvalidDataError: where a policy has no true value.
         """
         values = truth if isinstance(truth, Mapping) else getattr(truth, "values", None)
         if not isinstance(values, Mapping):
             raise ConfigurationError(f"truth must map policies to true values, or have such values, got {truth!r}.")
-        gamma = getattr(truth, "gamma", self.question.gamma)
-        if gamma != self.question.gamma:
-            raise ConfigurationError(f"The truth is of gamma={gamma}, the estimates of gamma={self.question.gamma}.")
+        for name in ("gamma", "horizon"):
+            asked, known_for = getattr(self.question, name), getattr(truth, name, getattr(self.question, name))
+            if asked != known_for:
+                raise ConfigurationError(f"The truth is of {name}={known_for}, the estimates of {name}={asked}.")
         known = {str(name): float(cast(float, value)) for name, value in cast("Mapping[Any, Any]", values).items()}
         return metrics.summary(self, known, convention=convention)
 

@@ -194,6 +194,8 @@ def test_compare_and_t_test(real: minari.MinariDataset) -> None:
         assert row["mae"] == pytest.approx(np.mean([abs(r["value"] - truth[r["policy"]]) for r in result.rows]))
     with pytest.raises(ConfigurationError, match=r"truth is of gamma=0\.5"):
         result.compare(SimpleNamespace(values=truth, gamma=0.5))
+    with pytest.raises(ConfigurationError, match=r"truth is of horizon=3, the estimates of horizon=None"):
+        result.compare(SimpleNamespace(values=truth, gamma=GAMMA, horizon=3))
     with pytest.raises(ConfigurationError, match="truth must map policies"):
         result.compare(3.0)
     tests = {row["policy"]: row for row in result.t_test("same")}
