@@ -1,37 +1,39 @@
 """Build the embedded dataset maze2d-umaze: planner episodes in PointMaze_UMaze-v3, and its picture.
 
     python datasets/build_maze2d_umaze.py --episodes 250 --seed 0 --out datasets/maze2d-umaze
+    python datasets/build_maze2d_umaze.py --episodes 12000 --jobs 4 --out maze2d-umaze-12000
 
-A planner of ours walks the shortest path over the maze's free cells; a PD controller with action noise follows the
-way-points. Starts and goals are the environment's random ones. Episodes end in the goal (terminated) or at 300 steps
-(truncated). The same seed and library versions give the same bytes.
+A planner of ours (`oat_gym.domains.maze2d_planner.Planner`) walks the shortest path over the maze's free cells; a PD
+controller with action noise follows the way-points. Starts and goals are the environment's random ones. Episodes end in
+the goal (terminated) or at 300 steps (truncated). The same seed and library versions give the same bytes, whatever the
+number of processes, and the first episodes are the same whatever their number. A build that is interrupted leaves what
+was there before.
 """
 
 from __future__ import annotations
 
 import argparse
-import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import gymnasium_robotics
 import h5py
 import numpy as np
-import numpy.typing as npt
+from joblib import Parallel, delayed
 from minari.data_collector import EpisodeBuffer
 
 from oat_gym import plots
-from oat_gym.domains.maze2d import DATASET_ID, UMAZE
+from oat_gym.domains.maze2d import DATASET_ID
+from oat_gym.domains.maze2d_env import open_maze
+from oat_gym.domains.maze2d_layout import UMAZE
+from oat_gym.domains.maze2d_planner import Planner
 from oat_gym.io.writing import DatasetCard, dataset_from_episodes
 
-FloatArray = npt.NDArray[np.float64]
-Observation = dict[str, FloatArray]
-
+EMBEDDED_EPISODES = 250
+CHUNK = 250  # episodes that a process records at a time
+DRAWN = 250  # episodes in the picture
 MAIN_FILE = "main_data.hdf5"
 OLDEST_MINARI = "0.5.3"  # a Minari refuses data that says it is from a newer one; the layout is that of 0.5.3
 EXPERT_RETURN = 1.0  # each episode that reaches its goal earns exactly 1
@@ -40,52 +42,6 @@ DESCRIPTION = (
     "shortest path over the maze's cells, PD control to its way-points, Gaussian action noise. Reward 1 on reaching "
     "the goal, which terminates the episode; 300 steps truncate it. Made by oat_gym, not by D4RL."
 )
-
-
-@dataclass(frozen=True)
-class Planner:
-    """Way-points of the shortest path, followed by a PD controller with Gaussian action noise.
-
-    Args:
-        position_gain: force for each metre to the way-point.
-        velocity_gain: force against each metre a second of velocity.
-        noise: standard deviation of the noise on each action entry (before clipping to [-1, 1]).
-        reach: a way-point within this many metres is passed.
-    """
-
-    position_gain: float = 1.6
-    velocity_gain: float = 0.3
-    noise: float = 0.3
-    reach: float = 0.35
-
-    def waypoints(self, observation: Observation) -> list[FloatArray]:
-        """Return the points to visit from the start's cell (left out) to the goal itself."""
-        start, goal = UMAZE.cell_of(observation["achieved_goal"]), UMAZE.cell_of(observation["desired_goal"])
-        between = UMAZE.shortest_path(start, goal)[1:-1]
-        return [*(UMAZE.center(cell) for cell in between), observation["desired_goal"]]
-
-    def action(
-        self, observation: Observation, waypoints: list[FloatArray], rng: np.random.Generator
-    ) -> npt.NDArray[np.float32]:
-        """Return the next action, in [-1, 1]; passed way-points are removed from `waypoints`."""
-        position, velocity = observation["observation"][:2], observation["observation"][2:]
-        while len(waypoints) > 1 and np.linalg.norm(waypoints[0] - position) < self.reach:
-            del waypoints[0]
-        force = self.position_gain * (waypoints[0] - position) - self.velocity_gain * velocity
-        return np.clip(force + self.noise * rng.standard_normal(2), -1.0, 1.0).astype(np.float32)
-
-
-@contextmanager
-def open_maze() -> Iterator[gym.Env[Any, Any]]:
-    """Open the environment, and remove the XML file that it leaves in the temporary folder."""
-    gym.register_envs(gymnasium_robotics)
-    env = gym.make("PointMaze_UMaze-v3", continuing_task=False)
-    try:
-        yield env
-    finally:
-        model_file = Path(env.unwrapped.tmp_xml_file_path)  # type: ignore[attr-defined]
-        env.close()
-        model_file.unlink(missing_ok=True)
 
 
 def record_episode(env: gym.Env[Any, Any], planner: Planner, *, seed: int) -> EpisodeBuffer:
@@ -146,11 +102,28 @@ def compact(source: Path, target: Path) -> None:
         copy(old, new)
 
 
-def build(out: Path, *, episodes: int, seed: int, reference_episodes: int = 100) -> None:
-    """Write `out/data` (the Minari dataset) and `out/trajectories.png`, in place of what was there."""
-    seeds = np.random.SeedSequence(seed).generate_state(episodes)
-    with open_maze() as env, tempfile.TemporaryDirectory() as temporary:
-        recorded = [record_episode(env, Planner(), seed=int(value)) for value in seeds]
+def record_chunk(seeds: Sequence[int]) -> list[EpisodeBuffer]:
+    """Return one episode a seed, in an environment of their own."""
+    with open_maze() as env:
+        return [record_episode(env, Planner(), seed=seed) for seed in seeds]
+
+
+def record(episodes: int, *, seed: int, jobs: int) -> list[EpisodeBuffer]:
+    """Return the episodes of a dataset; the number of processes makes no difference to them."""
+    seeds = [int(value) for value in np.random.SeedSequence(seed).generate_state(episodes)]
+    chunks = [seeds[start : start + CHUNK] for start in range(0, episodes, CHUNK)]
+    made = Parallel(n_jobs=jobs)(delayed(record_chunk)(chunk) for chunk in chunks)
+    return [episode for chunk in made for episode in chunk]
+
+
+def dataset_id(episodes: int) -> str:
+    """Return the Minari id of a dataset of so many episodes: the embedded one has 250."""
+    return DATASET_ID if episodes == EMBEDDED_EPISODES else f"oat_gym/maze2d-umaze-{episodes}-v0"
+
+
+def write(recorded: list[EpisodeBuffer], folder: Path, *, reference_episodes: int) -> None:
+    """Write the Minari dataset of the episodes to `folder/data`, with contiguous arrays."""
+    with open_maze() as env:
         extra = {
             "ref_min_score": random_return(env, episodes=reference_episodes),
             "ref_max_score": EXPERT_RETURN,
@@ -159,9 +132,9 @@ def build(out: Path, *, episodes: int, seed: int, reference_episodes: int = 100)
         }
         storage = dataset_from_episodes(
             recorded,
-            directory=Path(temporary) / "dataset",
+            directory=folder,
             card=DatasetCard(
-                dataset_id=DATASET_ID,
+                dataset_id=dataset_id(len(recorded)),
                 description=DESCRIPTION,
                 author="The oat_gym developers",
                 algorithm_name="shortest path and noisy PD control",
@@ -173,27 +146,36 @@ def build(out: Path, *, episodes: int, seed: int, reference_episodes: int = 100)
             observation_space=env.observation_space,
             action_space=env.action_space,
         ).storage
-        data = Path(temporary) / "dataset" / "data"
-        compact(data / MAIN_FILE, Path(temporary) / MAIN_FILE)
-        (Path(temporary) / MAIN_FILE).replace(data / MAIN_FILE)
-        storage.update_metadata({"dataset_size": storage.get_size()})
-        out.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(out / "data", ignore_errors=True)
-        shutil.copytree(data, out / "data")
-    positions = [episode.observations["observation"][:, :2] for episode in recorded]  # type: ignore[index]
+    compact(folder / "data" / MAIN_FILE, folder / MAIN_FILE)
+    (folder / MAIN_FILE).replace(folder / "data" / MAIN_FILE)
+    storage.update_metadata({"dataset_size": storage.get_size()})
+
+
+def build(out: Path, *, episodes: int, seed: int, jobs: int = 1, reference_episodes: int = 100) -> None:
+    """Write `out/data` (the Minari dataset) and `out/trajectories.png`, in place of what was there."""
+    recorded = record(episodes, seed=seed, jobs=jobs)
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out, prefix=".making-") as temporary:
+        folder = Path(temporary) / "dataset"
+        write(recorded, folder, reference_episodes=reference_episodes)
+        if (out / "data").exists():
+            (out / "data").rename(Path(temporary) / "old")
+        (folder / "data").rename(out / "data")
+    positions = [episode.observations["observation"][:, :2] for episode in recorded[:DRAWN]]  # type: ignore[index]
     plots.maze_figure(positions, maze=UMAZE.walls(), path=out / "trajectories.png")
 
 
 def main() -> None:
     """Read the command line and build."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--episodes", type=int, default=250)
+    parser.add_argument("--episodes", type=int, default=EMBEDDED_EPISODES)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "maze2d-umaze")
     options = parser.parse_args()
     if options.episodes < 1:
         parser.error(f"--episodes must be at least 1, got {options.episodes}")
-    build(options.out, episodes=options.episodes, seed=options.seed)
+    build(options.out, episodes=options.episodes, seed=options.seed, jobs=options.jobs)
     print(f"wrote {options.episodes} episodes to {options.out}")
 
 

@@ -74,14 +74,17 @@ def roll_out(
         record: what to keep of the episodes; `None`: rewards only.
 
     Raises:
-        ConfigurationError: for a horizon below 1, no seeds, or environments that reset within the ending step.
+        ConfigurationError: for a horizon below 1, no seeds, other autoreset modes than next-step, or infos
+            to record that the environment does not give.
         InvalidDataError: if the policy gives actions that are not finite.
     """
     if horizon < 1 or not len(seeds):
         raise ConfigurationError(f"roll_out takes seeds and a horizon of at least 1; got {len(seeds)} and {horizon}.")
-    if envs.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
-        raise ConfigurationError("roll_out needs environments that do not reset within the step that ends an episode.")
-    batches = [list(seeds[start : start + envs.num_envs]) for start in range(0, len(seeds), envs.num_envs)]
+    mode = envs.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+    if mode != AutoresetMode.NEXT_STEP:  # within the ending step: its observation is lost; never: it cannot be stepped
+        raise ConfigurationError(f"roll_out needs environments with next-step autoreset, got {mode}.")
+    whole = [int(seed) for seed in seeds]  # Gymnasium refuses NumPy's integers
+    batches = [whole[start : start + envs.num_envs] for start in range(0, len(whole), envs.num_envs)]
     parts = [
         _batch(envs, policy, batch, horizon=horizon, rng=derive(policy_seed, "roll-out", number), record=record)
         for number, batch in enumerate(batches)
@@ -111,12 +114,14 @@ def _batch(
     tape = _Tape(record, observations) if record else None
     for step in range(horizon):
         actions = _actions(policy, observations, envs.single_action_space, rng)
+        if tape:
+            tape.act(policy, observations, actions)
         following, reward, ends, cuts, infos = envs.step(actions)
         rewards[alive, step] = reward[alive]
         lengths += alive
         terminated |= alive & ends
         if tape:
-            tape.add(policy, observations, actions, following, infos)
+            tape.see(following, infos, alive)
         alive = alive & ~ends & ~cuts
         observations = following
         if not alive.any():
@@ -145,15 +150,24 @@ class _Tape:
         if record.log_prob:
             self.infos["log_prob"] = []
 
-    def add(self, policy: Policy, observations: Batch, actions: Batch, following: Batch, infos: dict[str, Any]) -> None:
+    def act(self, policy: Policy, observations: Batch, actions: Batch) -> None:
+        """Keep the actions, before a step in which an environment may write over them or the observations."""
         self.actions.append(copy_tree(actions))
+        if self.record.log_prob:
+            self.infos["log_prob"].append(np.array(policy.log_prob(observations, actions)))
+
+    def see(self, following: Batch, infos: dict[str, Any], alive: npt.NDArray[np.bool_]) -> None:
+        """Keep what a step led to; `alive` are the environments whose episodes it belongs to."""
         self.observations.append(copy_tree(following))
         for name in self.record.infos:
-            if name not in infos:
-                raise ConfigurationError(f"The environment's infos lack {name!r}; they have {sorted(infos)}.")
+            given = infos.get(
+                f"_{name}", np.ones_like(alive)
+            )  # a mask of the environments that gave it, where there is one
+            if name not in infos or not given[alive].all():
+                raise ConfigurationError(f"The environment's infos lack {name!r} in a step; they have {sorted(infos)}.")
+            if isinstance(infos[name], dict):
+                raise ConfigurationError(f"The environment's info {name!r} is nested; name infos that are arrays.")
             self.infos[name].append(np.array(infos[name]))
-        if self.record.log_prob:
-            self.infos["log_prob"].append(policy.log_prob(observations, actions))
 
     def episodes(
         self, rewards: FloatArray, lengths: npt.NDArray[np.int64], terminated: npt.NDArray[np.bool_], seeds: list[int]

@@ -85,7 +85,7 @@ def stored_truth(
         InvalidDataError: for rewards of unequal shapes, of fewer than two episodes, or not finite.
     """
     shapes = {array.shape for array in rewards.values()}
-    if len(shapes) != 1 or (shape := next(iter(shapes)))[0] < 2 or shape[1] != horizon:
+    if len(shapes) != 1 or len(shape := next(iter(shapes))) != 2 or shape[0] < 2 or shape[1] != horizon:
         raise InvalidDataError(f"Rewards must be (episodes, {horizon}) alike, two episodes or more; got {shapes}.")
     if not all(np.isfinite(array).all() for array in rewards.values()):
         raise InvalidDataError("Roll-outs gave rewards that are not finite.")
@@ -95,7 +95,9 @@ def stored_truth(
         "versions": installed_versions(),
         "command": command,
         "note": note,
-        "values": {str(gamma): {name: _moments(array, gamma) for name, array in rewards.items()} for gamma in gammas},
+        "values": {
+            str(float(gamma)): {name: _moments(array, gamma) for name, array in rewards.items()} for gamma in gammas
+        },
     }
 
 

