@@ -1,4 +1,9 @@
-"""Tutoring: the log of a real reinforcement-learning tutor (SmartPrimer), with its action probabilities."""
+"""Tutoring: the log of a real reinforcement-learning tutor (SmartPrimer), and simulated students.
+
+The paper's log is private. `tutoring-smartprimer` is a real one, of another tutor, with the probability that every
+action had; the true values of policies are not known, but what students achieved is (`outcomes`). `tutor-sim` is a
+simulation of the paper's task, where values are known (`oat_gym.domains.tutor_sim`).
+"""
 
 from __future__ import annotations
 
@@ -13,11 +18,18 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from oat_gym.domains import tutor_sim
 from oat_gym.domains._data import converted, find_file
+from oat_gym.domains.dqn import DQN, EVALUATION_EPSILON, QNetwork
 from oat_gym.domains.task import Task
+from oat_gym.domains.tutor_outcomes import Outcome, mean_and_error, outcomes
+from oat_gym.domains.tutor_policies import ConstantPolicy, RecordedPolicy
+from oat_gym.embedded import embedded_file
 from oat_gym.errors import InvalidDataError
 from oat_gym.io.tables import episodes_from_table
 from oat_gym.io.writing import DatasetCard, dataset_from_episodes
+from oat_gym.ope.policies import UniformPolicy
+from oat_gym.ope.policy import Policy
 
 DATASET_ID = "oat_gym/tutoring-smartprimer-v0"
 FILE = "tutoring/smartprimer/smartprimer_offline_with_probabilities_numeric.csv"
@@ -135,8 +147,57 @@ def _taken_probability(table: dict[str, npt.NDArray[np.float64]], source: Path) 
     return np.maximum(taken, PROBABILITY_FLOOR)
 
 
-DATASETS: dict[str, Callable[[], minari.MinariDataset]] = {"tutoring-smartprimer": smartprimer}
+def train_policy(dataset: minari.MinariDataset) -> QNetwork:
+    """Return the network of the task's policy "dqn", trained on the log at the paper's default settings."""
+    return DQN().fit(dataset, seed=0)
+
+
+def policies() -> dict[str, Policy]:
+    """Return the target policies of the log: the tutor itself as logged, a DQN, uniform, and one for each action.
+
+    The DQN and the four that prefer an action take another one with probability 0.05 in all, as Mnih et al. evaluate.
+
+    Raises:
+        DatasetNotFoundError: if the log is not there ("logged" is made of it), or the installation lacks the network.
+    """
+    space, epsilon = spaces.Discrete(len(ACTIONS)), EVALUATION_EPSILON
+    path = embedded_file("tutoring-smartprimer/policies/dqn.safetensors")
+    network = QNetwork.load(path, observation_space=_observation_space(), action_space=space)
+    constant = {
+        name: ConstantPolicy.mostly(action, n_actions=len(ACTIONS), epsilon=epsilon)
+        for action, name in enumerate(ACTIONS)
+    }
+    return {
+        "logged": RecordedPolicy.of(smartprimer()),
+        "dqn": network.softened(epsilon),
+        "uniform": UniformPolicy(space),
+        **constant,
+    }
+
+
+DATASETS: dict[str, Callable[[], minari.MinariDataset]] = {
+    "tutoring-smartprimer": smartprimer,
+    **tutor_sim.DATASETS,
+}
 """Name of each dataset and the function that opens it."""
 
-TASKS: dict[str, Task] = {}
-"""Name of each task and what its datasets are evaluated with."""
+TASKS: dict[str, Task] = {
+    "tutoring-smartprimer": Task(
+        datasets=("tutoring-smartprimer",), policies=policies, gamma=tutor_sim.GAMMA, paper="tutoring"
+    ),
+    **tutor_sim.TASKS,
+}
+"""Name of each task and what its datasets are evaluated with; nobody knows true values of the real log."""
+
+__all__ = [
+    "ACTIONS",
+    "DATASETS",
+    "FEATURES",
+    "TASKS",
+    "Outcome",
+    "mean_and_error",
+    "outcomes",
+    "policies",
+    "smartprimer",
+    "train_policy",
+]

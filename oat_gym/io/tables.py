@@ -29,19 +29,19 @@ class Table(Protocol):
         ...
 
 
-def episodes_from_table(
-    table: Table,
-    *,
+def episodes_from_table(  # noqa: PLR0917  (the columns are part of the data)
+    frame: Table,
     episode: str,
     order: str,
     observations: Columns,
     action: Columns,
     reward: str,
-    terminated: bool | str = True,
-    propensity: str | None = None,
     time: str | None = None,
+    propensity: str | None = None,
+    *,
+    terminated: bool | str = True,
     infos: Sequence[str] = (),
-    consecutive: bool = False,
+    consecutive: bool | None = None,
 ) -> list[EpisodeBuffer]:
     """Return the episodes of a log (a row a decision, in any order), in the order of `np.unique` of their ids.
 
@@ -50,32 +50,35 @@ def episodes_from_table(
     **cut off** has T = L - 1 steps, since where its last action led is unknown. Infos have T rows, one a step.
 
     Args:
-        table: pandas or polars frame, pyarrow table, or a mapping from column names to arrays.
+        frame: pandas or polars frame, pyarrow table, or a mapping from column names to arrays.
         episode: column of episode ids (numbers or strings).
         order: column that orders the rows of an episode (numbers or dates).
         observations: one column, or several that form vectors; they become float64.
         action: one column, or several that form vectors; integers stay integers.
         reward: column of rewards.
-        terminated: True or False for all episodes, or a column that is 1 in the last row of those that terminated.
-        propensity: column with the probability that the action taken had, in (0, 1]; gives `infos["log_prob"]`.
         time: column of times (numbers or dates), given back as `infos["time"]`, in seconds where it holds dates.
+        propensity: column with the probability that the action taken had, in (0, 1]; gives `infos["log_prob"]`.
+        terminated: True or False for all episodes, or a column that is 1 in the last row of those that terminated.
         infos: further columns, each given back as `infos[column]`.
-        consecutive: require `order` to go up by exactly 1 in each episode, so that a lost row is an error.
+        consecutive: require `order` to go up by exactly 1 in each episode, so that a lost row is an error; None, the
+            default: where it holds integers. Give False where they are times, or other numbers with gaps.
 
     Raises:
         ConfigurationError: if the table lacks a column.
         InvalidDataError: for unequal or empty columns, values that are no finite numbers, two rows with one order, gaps
-            (where `consecutive`), probabilities outside (0, 1], and ends that leave an episode no complete step.
+            (see `consecutive`), probabilities outside (0, 1], and ends that leave an episode no complete step.
 
     >>> log = {"id": [7, 7, 7], "t": [2, 0, 1], "x": [0.2, 0.0, 0.1], "a": [0, 1, 1], "r": [1.0, 0.0, 0.0]}
     >>> found = episodes_from_table(log, episode="id", order="t", observations=["x"], action="a", reward="r")
     >>> found[0].observations.ravel().tolist(), found[0].actions.tolist()
     ([0.0, 0.1, 0.2, 0.2], [1, 1, 0])
     """
-    ids, position = _identifiers(table, episode), _ordinals(table, order)
-    steps = _step_columns(table, observations, action, reward) | {"ended": _ends(table, terminated, len(ids))}
-    extras = _info_columns(table, infos, propensity, time)
+    ids, position = _identifiers(frame, episode), _ordinals(frame, order)
+    steps = _step_columns(frame, observations, action, reward) | {"ended": _ends(frame, terminated, len(ids))}
+    extras = _info_columns(frame, infos, propensity, time)
     _check_lengths(episode, len(ids), {order: position, **steps, **extras})
+    if consecutive is None:
+        consecutive = position.dtype.kind in "iu"
     parts = _sorted_rows(ids, position, names=(episode, order), consecutive=consecutive)
     _check_ends(ids, steps["ended"], parts, from_column=isinstance(terminated, str))
     return [_episode(ids[part[0]], _take(steps, part), _take(extras, part)) for part in parts]
@@ -111,7 +114,10 @@ def _column(table: Table, name: str) -> Array:
         raise ConfigurationError(
             f"The table has no column {name!r}; its columns are {_column_names(table)}."
         ) from error
-    array = np.asarray(values.to_numpy() if hasattr(values, "to_numpy") else values)
+    if getattr(getattr(values, "dtype", None), "tz", None) is not None:  # pandas would give objects; in UTC
+        array = values.to_numpy(dtype="datetime64[ns]")
+    else:
+        array = np.asarray(values.to_numpy() if hasattr(values, "to_numpy") else values)
     if array.ndim != 1:
         raise InvalidDataError(f"Column {name!r} has shape {array.shape}; a column has one value a row.")
     return array

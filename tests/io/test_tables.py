@@ -122,7 +122,8 @@ def changed(column, row, value):
     ("table", "options", "message"),
     [
         (changed("t", 4, 11.0 + 2), {}, "Episode id=9 has two rows with t=13"),
-        (changed("t", 7, 20), {"consecutive": True}, "Episode id=9 goes from t=13 to 20 .1 such gaps"),
+        (changed("t", 7, 20), {}, "Episode id=9 goes from t=13 to 20 .1 such gaps"),
+        (changed("t", 7, 20.0), {"consecutive": True}, "Episode id=9 goes from t=13.0 to 20.0 .1 such gaps"),
         (changed("x", 2, np.nan), {}, "'x' has 1 missing or infinite values, the first in row 2"),
         (changed("r", 0, np.inf), {}, "'r' has 1 missing"),
         (changed("t", 3, np.nan), {}, "'t' has 1 missing"),
@@ -148,6 +149,48 @@ def test_a_missing_column_is_named_with_those_there_are(form):
         episodes_from_table(form(make_table()), **(ROLES | {"reward": "z"}))
     with pytest.raises(ConfigurationError, match="name at least one"):
         episodes_from_table(form(make_table()), **(ROLES | {"observations": []}))
+
+
+def test_columns_can_be_given_by_place():
+    table = make_table()
+    placed = episodes_from_table(table, "id", "t", ["x", "y"], "a", "r", "t", "p")
+    named = episodes_from_table(table, **ROLES, time="t", propensity="p")
+    for one, two in zip(placed, named, strict=True):
+        np.testing.assert_array_equal(one.observations, two.observations)
+        np.testing.assert_array_equal(one.rewards, two.rewards)
+        assert {name: rows.tolist() for name, rows in one.infos.items()} == {
+            name: rows.tolist() for name, rows in two.infos.items()
+        }
+
+
+@pytest.mark.parametrize("options", [{"consecutive": False}, {}])
+def test_gaps_pass_where_they_are_expected(options):
+    table = changed("t", 7, 20 if options else 20.5)  # real numbers are no count of rows
+    assert [len(episode) for episode in episodes_from_table(table, **ROLES, **options)] == [3, 5, 2]
+
+
+@pytest.mark.parametrize("form", [pd.DataFrame, pa.table])
+def test_missing_numbers_of_nullable_columns_are_found(form):
+    table = make_table()
+    actions = table["a"].tolist()
+    actions[4] = None
+    column = pd.array(actions, dtype="Int64") if form is pd.DataFrame else pa.array(actions)
+    with pytest.raises(InvalidDataError, match="'a' has 1 missing or infinite values, the first in row 4"):
+        episodes_from_table(form(table | {"a": column}), **ROLES)
+    whole = pd.DataFrame(make_table()).convert_dtypes()
+    assert episodes_from_table(whole, **ROLES)[0].actions.dtype.kind == "i"
+
+
+def test_dates_with_a_time_zone_are_read_as_utc():
+    table = pd.DataFrame(make_table())
+    plain = pd.Timestamp("2020-01-01") + pd.to_timedelta(table["t"], unit="h")
+    zoned = (plain + pd.Timedelta(hours=1)).dt.tz_localize("Europe/Paris")
+    for one, two in zip(
+        episodes_from_table(table.assign(when=plain), **(ROLES | {"order": "when"}), time="when"),
+        episodes_from_table(table.assign(when=zoned), **(ROLES | {"order": "when"}), time="when"),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one.infos["time"], two.infos["time"])
 
 
 def test_examples_in_docstrings():
