@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import minari
 
-from oat_gym.domains import adroit, maze2d, tutoring
+from oat_gym.domains import adroit, maze2d, sepsis, sepsis_sim, sepsis_tabular, tutoring
 from oat_gym.domains.task import Task
 from oat_gym.domains.truth import Truth
 from oat_gym.errors import ConfigurationError
@@ -19,6 +19,9 @@ from oat_gym.spaces import Batch
 DATASETS: dict[str, Callable[[], minari.MinariDataset]] = {
     **maze2d.DATASETS,
     **adroit.DATASETS,
+    **sepsis.DATASETS,
+    **sepsis_sim.DATASETS,
+    **sepsis_tabular.DATASETS,
     **tutoring.DATASETS,
 }
 """Name of each dataset and the function that opens it."""
@@ -26,6 +29,9 @@ DATASETS: dict[str, Callable[[], minari.MinariDataset]] = {
 TASKS: dict[str, Task] = {
     **maze2d.TASKS,
     **adroit.TASKS,
+    **sepsis.TASKS,
+    **sepsis_sim.TASKS,
+    **sepsis_tabular.TASKS,
     **tutoring.TASKS,
 }
 """Name of each task and what its datasets are evaluated with."""
@@ -54,7 +60,9 @@ def task(name: str) -> Task:
     for candidate in TASKS.values():
         if name in candidate.datasets:
             return candidate
-    raise ConfigurationError(f"There is no task named {name!r}; the names are {', '.join(sorted(TASKS))}.")
+    raise ConfigurationError(
+        f"There is no task named {name!r}, nor one with such a dataset; the tasks are {', '.join(sorted(TASKS))}."
+    )
 
 
 def policies(name: str) -> dict[str, Policy]:
@@ -102,6 +110,9 @@ __all__ = [
     "load",
     "maze2d",
     "policies",
+    "sepsis",
+    "sepsis_sim",
+    "sepsis_tabular",
     "task",
     "truth",
     "tutoring",

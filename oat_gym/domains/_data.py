@@ -59,6 +59,15 @@ def converted(
     meets an old one.
     """
     content = hashlib.sha256(source.read_bytes()).hexdigest()
+    return generated(write, domain=name, content=content, version=version)
+
+
+def generated(write: Callable[[Path], minari.MinariDataset], **key: object) -> minari.MinariDataset:
+    """Return the dataset that `write` makes, from the cache where it was made before.
+
+    The cache knows it by `key` (name, size, seed, version of the code, whatever the data depends on) and Minari's
+    version.
+    """
 
     def fill(data: Path) -> None:
         made = data.parent / "made"
@@ -67,4 +76,4 @@ def converted(
         (made / "data").rename(data)
         made.rmdir()
 
-    return cached_dataset(fingerprint(domain=name, content=content, version=version, minari=minari.__version__), fill)
+    return cached_dataset(fingerprint(minari=minari.__version__, **key), fill)

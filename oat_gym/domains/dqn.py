@@ -144,6 +144,11 @@ class QNetwork(CategoricalPolicy):
         values = self.q_values(observations)
         return np.eye(values.shape[1])[values.argmax(axis=1)]
 
+    @property
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Copies of what `save` writes: weights, the features' mean and scale, the rewards' scale."""
+        return {name: array.copy() for name, array in self._arrays.items()}
+
     def softened(self, epsilon: float = EVALUATION_EPSILON) -> EpsilonGreedyPolicy:
         """Return the epsilon-greedy policy, which gives every action a probability that importance weights can use."""
         return EpsilonGreedyPolicy(self, self._action_space, epsilon=epsilon)

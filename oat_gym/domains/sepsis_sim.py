@@ -10,6 +10,7 @@ networks, `datasets/truth_sepsis_sim.py` rolls all of them out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 from minari.data_collector import EpisodeBuffer
 
-from oat_gym.cache import fingerprint
+from oat_gym.domains._data import generated
 from oat_gym.domains._sepsis_clinician import Clinician
 from oat_gym.domains.dqn import DQN, QNetwork
 from oat_gym.domains.rollout import Recording, roll_out
@@ -30,7 +31,6 @@ from oat_gym.embedded import embedded_file
 from oat_gym.envs import SEPSIS_ID
 from oat_gym.envs import register as register_environments
 from oat_gym.envs._sepsis_space import ACTION_SPACE, OBSERVATION_SPACE
-from oat_gym.io._cached_dataset import cached_dataset
 from oat_gym.io.writing import DatasetCard, dataset_from_episodes, episode_buffer
 from oat_gym.ope.function_policy import FunctionPolicy
 from oat_gym.ope.policies import EpsilonGreedyPolicy
@@ -79,16 +79,8 @@ def load() -> minari.MinariDataset:
 
 def visits_dataset(visits: int, *, seed: int) -> minari.MinariDataset:
     """Return so many visits under the clinician's policy; visit v is the patient of `reset(seed=seed + v)`."""
-    key = fingerprint(domain=NAME, visits=visits, seed=seed, version=_VERSION, minari=minari.__version__)
-
-    def fill(data: Path) -> None:
-        made = data.parent / "made"
-        write_visits(made, visits=visits, seed=seed)
-        data.rmdir()
-        (made / "data").rename(data)
-        made.rmdir()
-
-    return cached_dataset(key, fill)
+    write = partial(write_visits, visits=visits, seed=seed)
+    return generated(write, domain=NAME, visits=visits, seed=seed, version=_VERSION)
 
 
 def write_visits(directory: Path, *, visits: int, seed: int) -> minari.MinariDataset:

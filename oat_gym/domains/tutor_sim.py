@@ -3,7 +3,7 @@
 The paper's tutoring log (1,307 students, 142 features, 12 problems) is private. Here the expert policy of the paper,
 which picks actions at random, teaches as many simulated students. Target policies are that expert and three networks
 trained by deep Q-learning at the paper's learning rates, on an expert log of other students.
-`datasets/build_tutor_sim.py` trains them, `datasets/truth_tutor_sim.py` rolls them out.
+`datasets/build_tutoring.py` trains them, `datasets/truth_tutor_sim.py` rolls them out.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 
-from oat_gym.domains._data import converted
+from oat_gym.domains._data import generated
 from oat_gym.domains.dqn import DQN, QNetwork
 from oat_gym.domains.rollout import Recording, RollOuts, roll_out
 from oat_gym.domains.task import Task
@@ -62,7 +62,7 @@ def tutor_sim(students: int = STUDENTS, *, seed: int = 0) -> minari.MinariDatase
         seed: of students and actions.
     """
     write = partial(_write, students, seed)
-    return converted(f"tutor-sim {students} {seed}", Path(tutor.__file__), version=_VERSION, write=write)
+    return generated(write, domain="tutor-sim", students=students, seed=seed, version=_VERSION)
 
 
 def _write(students: int, seed: int, folder: Path) -> minari.MinariDataset:

@@ -25,6 +25,7 @@ CELLS = {
         "--judging",
         "0.01",
     ),
+    "bench_envs.py": ("--beds", "20", "--steps", "5", "--peer-steps", "2"),
     "bench_augmenters.py": ("--dataset", "oat_gym/maze2d-umaze-v0", "--factor", "1.1", "--only", "jittering,spawner"),
 }
 
