@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -16,7 +17,7 @@ from oat_gym.ope.behavior import KnownBehavior, fit_log_prob, logged_log_prob
 from oat_gym.ope.cloning import BehaviorCloning
 from oat_gym.ope.estimator import Estimator
 from oat_gym.ope.logged import Logged
-from oat_gym.ope.policy import Policy
+from oat_gym.ope.policy import Policy, PolicySet
 from oat_gym.ope.problem import Part, Problem
 from oat_gym.spaces import Batch, get_leaf, iter_leaf_spaces, map_tree
 
@@ -61,7 +62,7 @@ class BehaviorSource:
         if isinstance(behavior, str | BehaviorCloning):
             fit = fit_log_prob(
                 problem.data,
-                config=BehaviorCloning() if isinstance(behavior, str) else behavior,
+                config=_of_one_kind(BehaviorCloning() if isinstance(behavior, str) else behavior, problem.policies),
                 seed=seed,
                 episodes=self._training,
                 device=problem.device,
@@ -70,6 +71,12 @@ class BehaviorSource:
             self.held_out[seed] = fit.held_out_log_likelihood
             return fit.log_prob
         return KnownBehavior(behavior).log_prob(problem.data, episodes=self._weighted)
+
+
+def _of_one_kind(config: BehaviorCloning, targets: PolicySet) -> BehaviorCloning:
+    """Return settings of cloning whose density is of the target policies' kind, where it was left to us."""
+    censored = all(getattr(policy, "censored", False) for policy in targets.policies)
+    return replace(config, density="censored") if config.density == "auto" and censored else config
 
 
 def check_behavior(behavior: Behavior) -> None:

@@ -44,8 +44,9 @@ class BehaviorCloning:
       (`GaussianPolicy(..., censored=True)`, `load_dope_policies(..., censored=True)`).
     - `"mixture"`: `components` diagonal Gaussians, for demonstrations of several kinds.
     - `"categorical"`: for actions without real columns (Discrete, MultiDiscrete, MultiBinary).
-    - `"auto"`: categorical without real columns; the tanh-Gaussian where every real column is bounded and more than
-      0.1% of the entries sit exactly on a bound; else the Gaussian. What was chosen is in `BehaviorFit.density`.
+    - `"auto"`: categorical without real columns; in `evaluate`, censored where every target policy counts that way;
+      else the tanh-Gaussian where every real column is bounded and more than 0.1% of the entries sit exactly on a
+      bound; else the Gaussian. What was chosen is in `BehaviorFit.density`.
 
     Discrete parts of mixed actions are categoricals in all of them.
 

@@ -294,6 +294,22 @@ def test_logged_propensities_are_the_known_policy() -> None:
     assert [row["value"] for row in logged.rows] == pytest.approx([row["value"] for row in known.rows])
 
 
+def test_the_clone_counts_clipped_actions_as_the_targets_do(walk_dataset: minari.MinariDataset) -> None:
+    small = ope.BehaviorCloning(hidden=(8,), max_updates=30, folds=2)
+
+    def values(config: ope.BehaviorCloning, *, censored: bool) -> list[float]:
+        target = ope.GaussianPolicy(lambda s: s[:, :2], 0.7, walk_dataset.action_space, censored=censored)  # type: ignore[arg-type]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", EstimationWarning)
+            found = evaluate(walk_dataset, target, IS, gamma=0.9, horizon=5, seeds=1, behavior=config, resamples=10)
+        return [row["value"] for row in found.rows]
+
+    for censored, kind in ((True, "censored"), (False, "gaussian")):
+        left_to_us = values(small, censored=censored)
+        assert left_to_us == values(replace(small, density=kind), censored=censored)
+        assert left_to_us != values(replace(small, density="mixture"), censored=censored)
+
+
 def test_ids_lists_and_single_policies_are_taken(real: minari.MinariDataset) -> None:
     by_id = evaluate("test/chain-v0", KNOWN, IS, gamma=GAMMA, seeds=1, behavior=KNOWN, resamples=20)
     assert [row["policy"] for row in by_id.rows] == ["policy-0"]
