@@ -1,0 +1,121 @@
+"""From cells to findings: improvements of every dataset, variant and estimator, and over tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from oat_gym.benchmark.improvement import Improvement, improve, over_tasks
+from oat_gym.benchmark.results import Results
+from oat_gym.benchmark.scores import METRICS, Draws, Metric, draw_scores
+from oat_gym.benchmark.store import CellResult
+from oat_gym.benchmark.variants import NONE
+
+FloatArray = npt.NDArray[np.float64]
+MEAN = "mean"
+"""In the place of a family: the average over the estimators."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The improvement of one dataset by one variant, for one family of estimators or "mean", by one metric.
+
+    `families` are those that it is of: a mean leaves out families that failed on either side.
+    """
+
+    dataset: str
+    variant: str
+    family: str
+    metric: Metric
+    improvement: Improvement
+    families: tuple[str, ...]
+
+
+@dataclass
+class Analysis:
+    """Improvements of the cells of one setting, computed when asked for and kept.
+
+    Only datasets whose true values are known have any.
+    """
+
+    results: Results
+    _cells: dict[tuple[str, str, str], dict[int, CellResult]] = field(init=False)
+    _draws: dict[tuple[str, str, str, tuple[int, ...], Metric], Draws] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._cells, self._draws = {}, {}
+        for cell in self.results.cells:
+            if not cell.failed:
+                self._cells.setdefault((cell.dataset, cell.variant, cell.family), {})[cell.seed] = cell
+
+    def with_truth(self) -> tuple[str, ...]:
+        """Return the datasets whose policies' true values are known."""
+        known = {cell.dataset for cell in self.results.cells if not cell.failed and cell.knows_truth}
+        return tuple(name for name in self.results.datasets if name in known)
+
+    def without_truth(self) -> tuple[str, ...]:
+        """Return the datasets of which only estimates can be given."""
+        return tuple(name for name in self.results.datasets if name not in self.with_truth())
+
+    def cells(self, dataset: str, variant: str, family: str) -> tuple[CellResult, ...]:
+        """Return the finished cells of one place in the tables, by seed."""
+        found = self._cells.get((dataset, variant, family), {})
+        return tuple(found[seed] for seed in sorted(found))
+
+    def scores(self, dataset: str, variant: str, family: str, metric: Metric) -> FloatArray:
+        """Return the metric of each seed, (S,); empty where nothing was measured."""
+        cells = self.cells(dataset, variant, family)
+        if not cells or not cells[0].knows_truth:
+            return np.empty(0)
+        return self._draw(dataset, variant, family, tuple(cell.seed for cell in cells), metric).points
+
+    def finding(self, dataset: str, variant: str, family: str, metric: Metric) -> Finding | None:
+        """Return an improvement; None where a side was not measured."""
+        families = self.results.families if family == MEAN else (family,)
+        both = [name for name in families if self._seeds(dataset, variant, (name,))]
+        seeds = self._seeds(dataset, variant, both)
+        if not both or not seeds or dataset not in self.with_truth():
+            return None
+        before = [self._draw(dataset, NONE, name, seeds, metric) for name in both]
+        after = [self._draw(dataset, variant, name, seeds, metric) for name in both]
+        cell = self.cells(dataset, NONE, both[0])[0]
+        n_policies, n_episodes = len(cell.policies), int(cell.record["n_episodes"])
+        improvement = improve(before, after, metric, n_policies=n_policies, n_episodes=n_episodes)
+        return Finding(dataset, variant, family, metric, improvement, tuple(both))
+
+    def over(self, datasets: Sequence[str], variant: str, family: str, metric: Metric) -> Finding | None:
+        """Return the mean improvement over several datasets; None where none was measured."""
+        found = [each for name in datasets if (each := self.finding(name, variant, family, metric)) is not None]
+        if not found:
+            return None
+        mean = over_tasks([each.improvement for each in found])
+        families = tuple(dict.fromkeys(name for each in found for name in each.families))
+        return Finding(", ".join(each.dataset for each in found), variant, family, metric, mean, families)
+
+    def all_findings(self) -> Iterable[Finding]:
+        """Give the improvements of every dataset with known truth, variant, family and "mean", and metric."""
+        for dataset in self.with_truth():
+            for variant in self.results.variants:
+                if variant == NONE:
+                    continue
+                for family in (MEAN, *self.results.families):
+                    for metric in METRICS:
+                        found = self.finding(dataset, variant, family, metric)
+                        if found is not None:
+                            yield found
+
+    def _seeds(self, dataset: str, variant: str, families: Sequence[str]) -> tuple[int, ...]:
+        """Return the seeds that both sides have for all of some families."""
+        sides = [self._cells.get((dataset, side, name), {}) for side in (NONE, variant) for name in families]
+        return tuple(sorted(set[int].intersection(*(set(side) for side in sides)))) if sides else ()
+
+    def _draw(self, dataset: str, variant: str, family: str, seeds: tuple[int, ...], metric: Metric) -> Draws:
+        key = (dataset, variant, family, seeds, metric)
+        if key not in self._draws:
+            cells = [self._cells[dataset, variant, family][seed] for seed in seeds]
+            values, replicates = np.stack([c.values for c in cells]), np.stack([c.replicates for c in cells])
+            self._draws[key] = draw_scores(values, replicates, cells[0].true, cells[0].true_errors, metric)
+        return self._draws[key]

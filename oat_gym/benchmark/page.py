@@ -1,0 +1,217 @@
+"""`oat-gym report`: one HTML page without any link to the outside, for readers who know the domain."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from oat_gym.benchmark import paper, story
+from oat_gym.benchmark.analysis import MEAN, Analysis
+from oat_gym.benchmark.results import Results, read_results
+from oat_gym.benchmark.runner import now
+from oat_gym.benchmark.scores import METRICS
+from oat_gym.benchmark.tables import adroit_dataset, all_tables, dataset_table, format_number
+from oat_gym.benchmark.variants import NONE
+from oat_gym.cache import Arrays, write_atomically
+
+TEMPLATE = "page.html.jinja"
+
+
+def write_page(folder: Path, path: Path) -> Path:
+    """Write the report of a folder of results to `path`; return the path.
+
+    Raises:
+        ConfigurationError: where nothing was run in the folder.
+        OSError: if the disk refuses.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, make_page(read_results(folder)).encode())
+    return path
+
+
+def make_page(results: tuple[Results, ...]) -> str:
+    """Return the page of one or more settings as HTML."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    template = environment.get_template(TEMPLATE)
+    return template.render(made=now(), settings=[_setting(each) for each in results], metrics=METRICS)
+
+
+def _setting(results: Results) -> dict[str, Any]:
+    analysis = Analysis(results)
+    groups = _groups(analysis)
+    seeds = sorted({cell.seed for cell in results.cells})
+    return {
+        "describe": results.setting.describe(),
+        "quick": results.setting.budget == "quick",
+        "budget_lines": sorted({m["budget_line"] for m in results.manifests if m["budget_line"]}),
+        "seeds": seeds,
+        "families": results.families,
+        "n_cells": len(results.cells),
+        "unfinished": results.unfinished,
+        "missing": results.missing,
+        "failed": _failed(results),
+        "groups": [_group(analysis, group, level) for group, level in groups],
+        "levels": story.by_level(analysis),
+        "datasets": [_dataset(analysis, name) for name in results.datasets],
+        "n_findings": sum(math.isfinite(found.improvement.value) for found in analysis.all_findings()),
+        "doubts": _doubts(analysis),
+        "costs": _costs(results),
+        "environments": _environments(results),
+        "commands": [manifest["command"] for manifest in results.manifests],
+        "tables": all_tables(analysis),
+    }
+
+
+def _groups(analysis: Analysis) -> list[tuple[story.Group, str | None]]:
+    """Return the groups of datasets whose improvements are averaged, and the level of the paper's numbers of each."""
+    groups: list[tuple[story.Group, str | None]] = []
+    for level in paper.LEVELS:
+        names = [name for task in paper.TASKS if (name := adroit_dataset(analysis, level, task))]
+        if names:
+            groups.append(((f"Adroit {level}: {len(names)} of 4 tasks", names), level))
+    adroit = {name for (_, names), _ in groups for name in names}
+    groups += [((name, [name]), None) for name in analysis.with_truth() if name not in adroit]
+    return groups
+
+
+def _group(analysis: Analysis, group: story.Group, level: str | None) -> dict[str, Any]:
+    return {
+        "title": group[0],
+        "datasets": group[1],
+        "rows": story.summary_rows(analysis, group),
+        "sentences": story.best_sentences(analysis, group),
+        "bars": story.bars(analysis, group, level=level),
+    }
+
+
+def _dataset(analysis: Analysis, name: str) -> dict[str, Any]:
+    results = analysis.results
+    made = [(arrays, value) for arrays, value in results.augmented if value["dataset"] == name]
+    made.sort(key=lambda pair: _order(results, pair[1]))
+    real = made[0][1]["real"] if made else None
+    known = name in analysis.with_truth()
+    cell = next((cell for cell in results.cells if cell.dataset == name and not cell.failed), None)
+    return {
+        "name": name,
+        "real": real,
+        "policies": () if cell is None else cell.policies,
+        "gamma": None if cell is None else cell.record["gamma"],
+        "horizon": None if cell is None else cell.record["horizon"],
+        "initial": "" if cell is None else cell.initial,
+        "truth_note": "" if cell is None else cell.record["truth_note"],
+        "knows_truth": known,
+        "mined": _mined(made),
+        "generated": [_generated(value) for _, value in _first_seeds(made) if value["synthetic"] is not None],
+        "coverage": _coverage(made),
+        "table": dataset_table(analysis, name) if known else None,
+        "truth_picture": story.truth_picture(analysis, name) if known else None,
+        "returns": story.returns_picture(analysis, name) if known else None,
+        "estimates": [] if known else story.estimate_table(analysis, name),
+        "agreement": next((story.agreement_picture(v) for _, v in made if v.get("agreement")), None),
+        "families": _family_bars(analysis, name) if known else [],
+    }
+
+
+def _order(results: Results, value: Mapping[str, Any]) -> tuple[int, int]:
+    names = list(results.variants)
+    return names.index(value["variant"]) if value["variant"] in names else len(names), int(value["seed"])
+
+
+def _first_seeds(made: list[tuple[Arrays, dict[str, Any]]]) -> list[tuple[Arrays, dict[str, Any]]]:
+    """Return the first seed of each variant."""
+    first: dict[str, tuple[Arrays, dict[str, Any]]] = {}
+    for pair in made:
+        first.setdefault(pair[1]["variant"], pair)
+    return list(first.values())
+
+
+def _mined(made: list[tuple[Arrays, dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Return what each variant that mines found, for its first seed."""
+    rows: list[dict[str, Any]] = []
+    for _, value in _first_seeds(made):
+        if value["mining"] is not None:
+            picture = story.support_picture(value["mining"])
+            rows.append({"variant": value["variant"], "seed": value["seed"], "picture": picture} | value["mining"])
+    return rows
+
+
+def _generated(value: Mapping[str, Any]) -> dict[str, Any]:
+    made, real = value["synthetic"], value["real"]
+    spread = [f"{format_number(part['returns'][2])} ({format_number(part['returns'][1])} to "
+              f"{format_number(part['returns'][3])})" for part in (real, made)]  # fmt: skip
+    return {
+        "variant": value["variant"],
+        "note": value["note"],
+        "episodes": made["episodes"],
+        "share": f"{100 * made['generated_steps'] / max(made['steps'], 1):.0f}%",
+        "untouched": made["untouched"],
+        "real_returns": spread[0],
+        "returns": spread[1],
+        "seam": "-" if made["seams"] is None else format_number(made["seams"][2]),
+        "seconds": format_number(value["cost"]["cpu_seconds"]),
+    }
+
+
+def _coverage(made: list[tuple[Arrays, dict[str, Any]]]) -> list[story.Picture]:
+    """Return pictures of at most two variants: OAT's first."""
+    there = [pair for pair in _first_seeds(made) if pair[1]["synthetic"] is not None]
+    there.sort(key=lambda pair: not pair[1]["variant"].startswith("oat"))
+    return [story.coverage_picture(*pair) for pair in there[:2]]
+
+
+def _family_bars(analysis: Analysis, name: str) -> list[story.Picture]:
+    pictures = [story.bars(analysis, (f"{name}, {family} alone", [name]), family=family)
+                for family in analysis.results.families]  # fmt: skip
+    return [picture for picture in pictures if picture is not None]
+
+
+def _failed(results: Results) -> list[dict[str, str]]:
+    """Return the failures, one row for each reason, with the cells that have it."""
+    reasons: dict[str, list[str]] = {}
+    for cell in results.cells:
+        if cell.failed:
+            where = f"{cell.dataset}, {cell.variant}, {cell.family}, seed {cell.seed}"
+            reasons.setdefault(cell.reason, []).append(where)
+    return [{"reason": reason, "cells": "; ".join(cells)} for reason, cells in reasons.items()]
+
+
+def _doubts(analysis: Analysis) -> list[tuple[str, int]]:
+    """Return how often each source of uncertainty is the largest, of the means over estimators, the commonest first."""
+    counts: dict[str, int] = {}
+    for found in analysis.all_findings():
+        if found.family == MEAN and math.isfinite(found.improvement.value):
+            counts[found.improvement.parts.main] = counts.get(found.improvement.parts.main, 0) + 1
+    return sorted(counts.items(), key=lambda pair: -pair[1])
+
+
+def _costs(results: Results) -> list[dict[str, str]]:
+    """Return CPU seconds and memory of each estimator: median and maximum over its cells."""
+    rows: list[dict[str, str]] = []
+    for family in results.families:
+        costs = [cell.record["cost"] for cell in results.cells if cell.family == family and "cost" in cell.record]
+        if costs:
+            seconds = sorted(float(cost["cpu_seconds"]) for cost in costs)
+            memory = max(float(cost["peak_memory_mb"]) for cost in costs)
+            numbers = (seconds[len(seconds) // 2], seconds[-1], memory)
+            rows.append(
+                {"family": family} | dict(zip(("median", "most", "memory"), map(format_number, numbers), strict=True))
+            )
+    return rows
+
+
+def _environments(results: Results) -> list[str]:
+    """Return the different environments that cells were computed in."""
+    texts = {
+        ", ".join(f"{name} {value}" for name, value in cell.record["environment"].items() if value)
+        for cell in results.cells
+    }
+    return sorted(texts)
+
+
+__all__ = ["NONE", "TEMPLATE", "make_page", "write_page"]

@@ -1,0 +1,219 @@
+"""Results of a folder: its newest cells, tidy tables of them, and CSV and parquet files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from oat_gym.benchmark.plan import read_manifests
+from oat_gym.benchmark.scores import METRICS, score
+from oat_gym.benchmark.store import CellResult, read_augmented, read_cells
+from oat_gym.cache import Arrays, write_atomically
+from oat_gym.errors import ConfigurationError
+from oat_gym.ope.intervals import bootstrap_interval, standard_error
+
+Row = dict[str, Any]
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What cells must share to stand in one table: the budget and where values count from."""
+
+    budget: str
+    initial: str
+    behavior: str
+    gamma: float | None
+
+    def describe(self) -> str:
+        """Return it in words."""
+        where = "the environment's first states" if self.initial == "reset" else "the data's first states"
+        return f"budget {self.budget!r}, values from {where}, behaviour policy {self.behavior!r}"
+
+
+@dataclass(frozen=True)
+class Results:
+    """The cells of one setting, with all that was noted beside them.
+
+    Attributes:
+        setting: what the cells share.
+        cells: one for each dataset, variant, estimator and seed, the newest where there are several.
+        manifests: of the runs of this setting, the oldest first.
+        augmented: (arrays, value) of what was mined and generated.
+    """
+
+    setting: Setting
+    cells: tuple[CellResult, ...]
+    manifests: tuple[dict[str, Any], ...]
+    augmented: tuple[tuple[Arrays, dict[str, Any]], ...]
+
+    @cached_property
+    def datasets(self) -> tuple[str, ...]:
+        """The datasets that have cells, in the order of the suites."""
+        asked = [name for manifest in self.manifests for name in manifest["datasets"]]
+        there = {cell.dataset for cell in self.cells}
+        return tuple(name for name in dict.fromkeys((*asked, *sorted(there))) if name in there)
+
+    @cached_property
+    def variants(self) -> tuple[str, ...]:
+        """The variants that have cells, in the order of the runs."""
+        asked = [name for manifest in self.manifests for name in manifest["jobs_order"]]
+        there = {cell.variant for cell in self.cells}
+        return tuple(name for name in dict.fromkeys((*asked, *sorted(there))) if name in there)
+
+    @cached_property
+    def families(self) -> tuple[str, ...]:
+        """The families of estimators, in the paper's order."""
+        order = ("FQE", "MB", "IS", "DR", "DICE")
+        there = {cell.family for cell in self.cells}
+        return tuple(name for name in order if name in there) + tuple(sorted(there - set(order)))
+
+    @property
+    def missing(self) -> dict[str, str]:
+        """Dataset -> why it was not at hand, of those that have no cell."""
+        told = {name: why for manifest in self.manifests for name, why in manifest["missing"].items()}
+        return {name: why for name, why in told.items() if name not in self.datasets}
+
+    @property
+    def unfinished(self) -> int:
+        """Number of cells that the runs asked for and that are not there, or failed."""
+        asked = {key for manifest in self.manifests for key in manifest["cells"]}
+        done = {cell.record["fingerprint"] for cell in self.cells if not cell.failed}
+        return len(asked - done)
+
+
+def read_results(folder: Path) -> tuple[Results, ...]:
+    """Return what a folder holds, the settings in the order in which they were first run.
+
+    Raises:
+        ConfigurationError: where nothing was run there.
+    """
+    manifests, cells, augmented = read_manifests(folder), list(read_cells(folder)), read_augmented(folder)
+    settings = dict.fromkeys(_manifest_setting(manifest) for manifest in manifests if manifest["question"])
+    found: list[Results] = []
+    for setting in settings or {Setting("", "reset", "clone", None): None}:
+        own = [m for m in manifests if not m["question"] or _manifest_setting(m) == setting]
+        members = [cell for cell in cells if _cell_setting(cell) == setting]
+        made = [pair for pair in augmented if pair[1]["budget"] == setting.budget]
+        found.append(Results(setting, _newest(members), tuple(own), tuple(made)))
+    return tuple(found)
+
+
+def _manifest_setting(manifest: dict[str, Any]) -> Setting:
+    question = manifest["question"]
+    return Setting(manifest["budget"]["name"], question["initial"], question["behavior"], question["gamma"])
+
+
+def _cell_setting(cell: CellResult) -> Setting:
+    question = cell.record["config"]["question"]
+    return Setting(cell.budget, question["initial"], question["behavior"], question["gamma"])
+
+
+def _newest(cells: Iterable[CellResult]) -> tuple[CellResult, ...]:
+    """Return the newest cell of each place in the tables; says how many are superseded by other settings."""
+    kept: dict[tuple[str, str, str, int], CellResult] = {}
+    superseded = 0
+    for cell in sorted(cells, key=lambda cell: (float(cell.record["finished"]), cell.record["fingerprint"])):
+        key = (cell.dataset, cell.variant, cell.family, cell.seed)
+        superseded += key in kept
+        kept[key] = cell
+    if superseded:
+        _log.warning("%d older cells of changed settings are left out of the tables.", superseded)
+    return tuple(sorted(kept.values(), key=lambda cell: (cell.dataset, cell.variant, cell.family, cell.seed)))
+
+
+def estimate_rows(results: Results) -> list[Row]:
+    """Return a row for each dataset, variant, estimator, seed and policy."""
+    rows: list[Row] = []
+    for cell in results.cells:
+        if cell.failed:
+            continue
+        errors = standard_error(cell.replicates)
+        low, high = bootstrap_interval(cell.replicates, n=int(cell.record["n_episodes"]))
+        for p, policy in enumerate(cell.policies):
+            numbers = {"value": cell.values[p], "standard_error": errors[p], "low": low[p], "high": high[p]}
+            numbers |= {"true": cell.true[p], "true_standard_error": cell.true_errors[p]}
+            rows.append(_head(cell) | {"policy": policy} | {name: float(value) for name, value in numbers.items()})
+    return rows
+
+
+def cell_rows(results: Results) -> list[Row]:
+    """Return a row for each dataset, variant, estimator and seed: metrics, costs, versions, why it failed."""
+    return [_head(cell) | _metrics(cell) | _costs(cell) | {"reason": cell.reason} for cell in results.cells]
+
+
+def _head(cell: CellResult) -> Row:
+    names = ("dataset", "task", "variant", "family", "estimator", "seed", "budget", "initial")
+    return {name: getattr(cell, name) for name in names}
+
+
+def _metrics(cell: CellResult) -> Row:
+    if cell.failed or not cell.knows_truth:
+        return dict.fromkeys(METRICS, math.nan)
+    return {name: float(score(cell.values, cell.true, name)) for name in METRICS}
+
+
+def _costs(cell: CellResult) -> Row:
+    cost, made = cell.record.get("cost", {}), cell.record.get("augmentation_cost", {})
+    costs = {name: cost.get(name, math.nan) for name in ("cpu_seconds", "wall_seconds", "peak_memory_mb")}
+    costs |= {"augment_cpu_seconds": made.get("cpu_seconds", math.nan), "augment_from_cache": made.get("from_cache")}
+    return costs | {"fingerprint": cell.record["fingerprint"]} | dict(cell.record["environment"])
+
+
+def write_tidy(results: Results, folder: Path) -> list[Path]:
+    """Write `estimates` and `cells` as CSV, and as parquet where pyarrow is installed; return the paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths: list[Path] = []
+    for name, rows in (("estimates", estimate_rows(results)), ("cells", cell_rows(results))):
+        if not rows:
+            continue
+        path = folder / f"{name}.csv"
+        write_atomically(path, to_csv(rows).encode())
+        paths.append(path)
+        written = _write_parquet(folder / f"{name}.parquet", rows)
+        paths += [written] if written else []
+    return paths
+
+
+def to_csv(rows: Sequence[Row]) -> str:
+    """Return rows as CSV; numbers that are not there are empty cells.
+
+    Raises:
+        ConfigurationError: without rows, since the columns would be unknown.
+    """
+    if not rows:
+        raise ConfigurationError("There are no rows to write.")
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _cell(value) for name, value in row.items()} for row in rows)
+    return text.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, float | np.floating):
+        return "" if math.isnan(value) else float(f"{value:.8g}")
+    return "" if value is None else value
+
+
+def _write_parquet(path: Path, rows: Sequence[Row]) -> Path | None:
+    try:
+        import pyarrow as pa  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
+        import pyarrow.parquet as pq  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        _log.info("pyarrow is not installed: %s is not written; the CSV file holds the same.", path.name)
+        return None
+    sink: Any = pa.BufferOutputStream()
+    pq.write_table(pa.Table.from_pylist(list(rows)), sink)
+    write_atomically(path, sink.getvalue().to_pybytes())
+    return path

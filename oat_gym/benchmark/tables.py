@@ -1,0 +1,278 @@
+"""The paper's tables in its layout, our numbers beside the paper's, as markdown and CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from oat_gym.benchmark import paper
+from oat_gym.benchmark.analysis import MEAN, Analysis, Finding
+from oat_gym.benchmark.scores import METRICS, Metric
+from oat_gym.benchmark.variants import NONE, VARIANTS
+from oat_gym.cache import write_atomically
+from oat_gym.ope import metrics as ope_metrics
+
+SIGNS = {"helps": "+", "hurts": "-", "no evidence": "", "not measured": ""}
+"""What stands behind a number that differs from no augmentation with an interval that excludes zero."""
+EXPERT = "expert"
+"""Name of the policy that others are tested against in table 1."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table as text: `name` for files, a caption, a header and rows of as many cells."""
+
+    name: str
+    caption: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def to_markdown(self) -> str:
+        """Return it as a markdown table under its caption."""
+        lines = [f"**{self.caption}**", "", _line(self.header), _line(("---",) * len(self.header))]
+        return "\n".join([*lines, *(_line(row) for row in self.rows), ""])
+
+    def to_csv(self) -> str:
+        """Return it as CSV, without the caption."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerows([self.header, *self.rows])
+        return text.getvalue()
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def all_tables(analysis: Analysis) -> tuple[Table, ...]:
+    """Return every table that the results fill at least one row of: the paper's, and those of other datasets."""
+    made: list[Table | None] = [table_1(analysis, dataset) for dataset in analysis.results.datasets]
+    made.append(table_2(analysis))
+    made += [paper_table(analysis, level, metric) for level in paper.LEVELS for metric in METRICS]
+    made += [dataset_table(analysis, dataset) for dataset in analysis.with_truth()]
+    made.append(improvement_table(analysis))
+    return tuple(table for table in made if table is not None)
+
+
+def write_tables(tables: Sequence[Table], folder: Path) -> list[Path]:
+    """Write each table as NAME.md and NAME.csv and all of them as tables.md; return the paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {f"{table.name}.{ending}": text for table in tables for ending, text in _forms(table)}
+    files["tables.md"] = "\n".join(table.to_markdown() for table in tables)
+    for name, text in files.items():
+        write_atomically(folder / name, text.encode())
+    return [folder / name for name in files]
+
+
+def _forms(table: Table) -> tuple[tuple[str, str], ...]:
+    return (("md", table.to_markdown()), ("csv", table.to_csv()))
+
+
+def adroit_dataset(analysis: Analysis, level: str, task: str) -> str | None:
+    """Return the dataset of a level and task of Adroit that was measured; None where there is none."""
+    kinds = (level, "cloned-from-expert") if level == "cloned" else (level,)
+    names = [f"adroit-{task}-{kind}" for kind in kinds]
+    return next((name for name in names if name in analysis.with_truth()), None)
+
+
+def paper_table(analysis: Analysis, level: str, metric: Metric) -> Table | None:
+    """Return one of tables 3 to 14: a row for each estimator and method, for each task ours and the paper's number."""
+    datasets = {task: adroit_dataset(analysis, level, task) for task in paper.TASKS}
+    if not any(datasets.values()):
+        return None
+    rows = [
+        (family, _method(variant), *_pairs(analysis, datasets, level, metric, family=family, variant=variant))
+        for family in analysis.results.families
+        for variant in analysis.results.variants
+    ]
+    number = paper.TABLES[level, metric]
+    header = ("estimator", "method", *(text for task in paper.TASKS for text in (task, "paper")))
+    caption = f"Table {number}. {METRICS[metric].capitalize()}, Adroit {level}. {_notes(analysis, datasets)}"
+    return Table(f"table-{number:02d}", caption, header, tuple(rows))
+
+
+def table_2(analysis: Analysis) -> Table | None:
+    """Return table 2: averages over the estimators, Adroit human, all four metrics of each task."""
+    datasets = {task: adroit_dataset(analysis, "human", task) for task in paper.TASKS}
+    if not any(datasets.values()):
+        return None
+    rows: list[tuple[str, ...]] = []
+    for task, dataset in datasets.items():
+        if dataset is None:
+            continue
+        for variant in analysis.results.variants:
+            cells = [
+                text
+                for metric in METRICS
+                for text in _pairs(analysis, {task: dataset}, "human", metric, family=MEAN, variant=variant)
+            ]
+            rows.append((task, _method(variant), *cells))
+    header = ("task", "method", *(text for name in METRICS.values() for text in (name, "paper")))
+    caption = f"Table 2. Averages over the estimators, Adroit human. {_notes(analysis, datasets)}"
+    return Table("table-02", caption, header, tuple(rows))
+
+
+def dataset_table(analysis: Analysis, dataset: str) -> Table:
+    """Return all metrics of one dataset: a row for each estimator (and their mean) and variant."""
+    rows = [
+        (family, variant, *(cell_text(analysis, dataset, variant, family, metric) for metric in METRICS))
+        for family in (*analysis.results.families, MEAN)
+        for variant in analysis.results.variants
+    ]
+    caption = f"All metrics of {dataset}. {_notes(analysis, {dataset: dataset})}"
+    return Table(f"dataset-{dataset}", caption, ("estimator", "variant", *METRICS.values()), tuple(rows))
+
+
+def improvement_table(analysis: Analysis) -> Table | None:
+    """Return every improvement with its interval and verdict."""
+    rows = [_improvement_row(found) for found in analysis.all_findings()]
+    if not rows:
+        return None
+    caption = (
+        "Improvements over no augmentation with 95% intervals (errors in percent less error, others in their own unit; "
+        f"positive is better). {analysis.results.setting.describe()}."
+    )
+    header = ("dataset", "variant", "estimator", "metric", "without", "with", "improvement", "low", "high", "verdict")
+    return Table("improvements", caption, (*header, "seeds", "most uncertain by"), tuple(rows))
+
+
+def _improvement_row(found: Finding) -> tuple[str, ...]:
+    change = found.improvement
+    numbers = [format_number(number) for number in (change.before, change.after, change.value, change.low, change.high)]
+    head = (found.dataset, found.variant, found.family, METRICS[found.metric])
+    return (*head, *numbers, change.verdict, str(change.n_seeds), change.parts.main)
+
+
+def table_1(analysis: Analysis, dataset: str) -> Table | None:
+    """Return table 1 for a dataset with a policy "expert": t and p of each other policy, by importance sampling.
+
+    "paper" is Welch's test of the two samples of replicates, as the paper describes it; its t grows with the number of
+    resamples. "paired" takes the deviation of paired differences as standard error (`ope.metrics.t_test`).
+    """
+    cells = analysis.cells(dataset, NONE, "IS")
+    if not cells or EXPERT not in cells[0].policies:
+        return None
+    others = [name for name in cells[0].policies if name != EXPERT]
+    rows = [
+        (_method(variant), method, *_tests(analysis, dataset, variant, others, method))
+        for variant in analysis.results.variants
+        for method in ("paper", "paired")
+        if analysis.cells(dataset, variant, "IS")
+    ]
+    rows += _empirical(analysis, dataset, others)
+    caption = (
+        f"Table 1. t and p of each policy against {EXPERT!r} on {dataset}, by importance sampling. "
+        f"{analysis.results.setting.describe()}."
+    )
+    return Table(f"table-01-{dataset}", caption, ("method", "test", *others), tuple(rows))
+
+
+def _tests(analysis: Analysis, dataset: str, variant: str, others: Sequence[str], method: str) -> list[str]:
+    cells = analysis.cells(dataset, variant, "IS")
+    draws = np.mean([cell.replicates for cell in cells], axis=0)
+    names, units = list(cells[0].policies), int(cells[0].record["n_episodes"])
+    texts: list[str] = []
+    for name in others:
+        sides = draws[names.index(name)], draws[names.index(EXPERT)]
+        if not np.isfinite(sides).all():
+            texts.append("-")
+            continue
+        test = ope_metrics.t_test(*sides, method="paper" if method == "paper" else "bootstrap", n=units)
+        texts.append(f"{test.statistic:.2f} ({test.p_value:.2f})")
+    return texts
+
+
+def _empirical(analysis: Analysis, dataset: str, others: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return the test of the true values, from their standard errors."""
+    from scipy import stats  # noqa: PLC0415  (slow to import, and needed here only)
+
+    cell = analysis.cells(dataset, NONE, "IS")[0]
+    if not cell.knows_truth:
+        return []
+    names, texts = list(cell.policies), list[str]()
+    for name in others:
+        p, q = names.index(name), names.index(EXPERT)
+        error = math.hypot(cell.true_errors[p], cell.true_errors[q])
+        t = float(cell.true[p] - cell.true[q]) / error if error > 0 else math.nan
+        texts.append("exact" if math.isnan(t) else f"{t:.2f} ({2 * stats.norm.sf(abs(t)):.2f})")
+    return [("Empirical result", "roll-outs", *texts)]
+
+
+def cell_text(analysis: Analysis, dataset: str, variant: str, family: str, metric: Metric) -> str:
+    """Return our number of a place in the tables: mean, deviation over seeds and the sign of an improvement."""
+    families = analysis.results.families if family == MEAN else (family,)
+    scores = [analysis.scores(dataset, variant, name, metric) for name in families]
+    scores = [part for part in scores if len(part)]
+    if not scores or (family == MEAN and len(scores) < len(families)):
+        return "-"
+    digits = 0 if metric == "mae" and abs(float(np.mean(scores[0]))) >= 100 else 2
+    known = [part[np.isfinite(part)] for part in scores]
+    if not all(len(part) for part in known):
+        return "-"
+    mean = float(np.mean([part.mean() for part in known]))
+    text = f"{mean:.{digits}f}"
+    if family != MEAN and len(known[0]) > 1:
+        text += f" ± {known[0].std(ddof=1):.{digits}f}"
+    found = None if variant == NONE else analysis.finding(dataset, variant, family, metric)
+    sign = "" if found is None else SIGNS[found.improvement.verdict]
+    return f"{text} {sign}".strip()
+
+
+def _pairs(
+    analysis: Analysis, datasets: dict[str, str | None], level: str, metric: Metric, *, family: str, variant: str
+) -> list[str]:
+    """Return, for each task, our number and the paper's."""
+    texts: list[str] = []
+    method = VARIANTS[variant].paper if variant in VARIANTS else ""
+    look_up: Callable[[str], paper.Printed] = (
+        (lambda task: paper.average(level, metric, method, task))
+        if family == MEAN
+        else (lambda task: paper.printed(level, metric, family, method, task))
+    )
+    for task, dataset in datasets.items():
+        ours = "" if dataset is None else cell_text(analysis, dataset, variant, family, metric)
+        theirs = look_up(task) if method and family in (*paper.ESTIMATORS, MEAN) else paper.Printed(math.nan)
+        texts += [ours, _printed(theirs, metric)]
+    return texts
+
+
+def _printed(number: paper.Printed, metric: Metric) -> str:
+    if not number.known:
+        return ""
+    digits = 0 if metric == "mae" else 2
+    text = f"{number.mean:.{digits}f}"
+    return text if math.isnan(number.deviation) else f"{text} ± {number.deviation:.{digits}f}"
+
+
+def _method(variant: str) -> str:
+    """Return a variant's name, with the paper's where it repeats a row of its tables."""
+    row = VARIANTS[variant].paper if variant in VARIANTS else ""
+    return f"{row} ({variant})" if row and row.lower() != variant else row or variant
+
+
+def _notes(analysis: Analysis, datasets: dict[str, str | None]) -> str:
+    """Return what a caption must say: setting, seeds, budget, signs, stand-ins."""
+    there = [name for name in datasets.values() if name is not None]
+    seeds = {cell.seed for cell in analysis.results.cells if cell.dataset in there and not cell.failed}
+    lines = {manifest["budget_line"] for manifest in analysis.results.manifests if manifest["budget_line"]}
+    text = f"{len(seeds)} seeds, mean ± standard deviation; {analysis.results.setting.describe()}; "
+    text += "; ".join(sorted(lines)) + ". + or - : better or worse than no augmentation, 95% interval excludes zero."
+    stand_ins = [name for name in there if name.endswith("-from-expert")]
+    return text + (f" Stand-ins, not the paper's data: {', '.join(stand_ins)}." if stand_ins else "")
+
+
+def format_number(value: float) -> str:
+    """Return a number with about three digits, "-" for NaN.
+
+    >>> format_number(1234.5), format_number(0.1234), format_number(float("nan"))
+    ('1234', '0.123', '-')
+    """
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

@@ -1,0 +1,186 @@
+"""`oat-gym bench`: a suite of the benchmark, resumable, over processes or a cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import sys
+from collections.abc import Generator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from oat_gym.benchmark.analysis import Analysis
+from oat_gym.benchmark.budget import BUDGETS
+from oat_gym.benchmark.job import JobReport
+from oat_gym.benchmark.plan import Plan, make_plan, write_manifest
+from oat_gym.benchmark.protocol import SUITES, Question, Suite, find_suite
+from oat_gym.benchmark.results import Results, read_results, write_tidy
+from oat_gym.benchmark.runner import Listener, Pace, format_seconds, run
+from oat_gym.benchmark.story import best_sentences
+from oat_gym.benchmark.tables import all_tables, write_tables
+from oat_gym.benchmark.variants import VARIANTS, Variant, find_variant, parse_variants
+from oat_gym.cli._shared import out
+from oat_gym.errors import ConfigurationError, DatasetNotFoundError
+
+Folder = Annotated[Path, typer.Option("--out", help="Folder of the results; a run goes on where it was stopped.")]
+
+
+def bench(
+    suite: Annotated[str, typer.Option(help=f"One of {', '.join(SUITES)}.")] = "quick",
+    augmenters: Annotated[str, typer.Option(help=f"all, or some of {', '.join(VARIANTS)}.")] = "all",
+    estimators: Annotated[str, typer.Option(help="all, or some of fqe,is,dice,dr,mb.")] = "all",
+    seeds: Annotated[int | None, typer.Option(help="How many seeds (0, 1, ...); the suite's own number.")] = None,
+    seed: Annotated[int | None, typer.Option(help="This seed alone, to share seeds out over machines.")] = None,
+    folder: Folder = Path("oat-gym-bench"),
+    jobs: Annotated[int, typer.Option(help="Processes at a time; -1: one for each core.")] = 1,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, as tcp://host:8786.")] = None,
+    device: Annotated[str, typer.Option(help="Torch device: cpu or cuda.")] = "cpu",
+    quick: Annotated[bool, typer.Option(help="A moment's training on few episodes: to see that it works.")] = False,
+    initial: Annotated[str, typer.Option(help="Where values count from: reset (the environment) or data.")] = "reset",
+    behavior: Annotated[str, typer.Option(help="Behaviour policy: clone, or logged.")] = "clone",
+    gamma: Annotated[float | None, typer.Option(help="Discount; the task's own.")] = None,
+) -> None:
+    """Compare ways of augmenting by what they do to off-policy evaluation.
+
+    Every dataset of the suite is augmented in every way and evaluated by every estimator with every seed. Finished
+    cells are files of the folder: run the same command again after an interruption and it goes on. Tables and CSV
+    files are written at the end; `oat-gym report FOLDER` makes a page of them.
+    """
+    chosen = find_suite(suite)
+    variants = _variants(chosen, augmenters)
+    numbers = _seeds(chosen, seeds, seed)
+    budget = BUDGETS["quick" if quick else chosen.budget].choose(estimators)
+    question = _question(initial, behavior, gamma)
+    _check_folder(folder)
+    _check_device(device)
+    plan = make_plan(chosen, variants, seeds=numbers, question=question, budget=budget)
+    _tell_plan(plan, folder)
+    if not plan.jobs:
+        raise DatasetNotFoundError(f"No dataset of the suite {suite!r} is on this machine: see above how to get them.")
+    command = f"oat-gym {shlex.join(sys.argv[1:])}"
+    write_manifest(folder, plan, seeds=numbers, device=device, command=command)
+    with _display(plan) as listen:
+        reports = run(plan, folder, n_jobs=jobs, scheduler=scheduler, device=device, listen=listen)
+    _tell_failures(reports)
+    for results in read_results(folder):
+        _finish(results, folder)
+    out.print(f"A page to read: oat-gym report {folder}")
+
+
+def _variants(suite: Suite, names: str) -> tuple[Variant, ...]:
+    if names.strip() == "all":
+        return tuple(find_variant(name) for name in suite.variants)
+    return parse_variants(names)
+
+
+def _seeds(suite: Suite, seeds: int | None, seed: int | None) -> list[int]:
+    if seed is not None and seeds is not None:
+        raise ConfigurationError("Give --seeds N for seeds 0 to N-1, or --seed S for one, not both.")
+    if seed is not None:
+        return [seed]
+    count = suite.seeds if seeds is None else seeds
+    if count < 1:
+        raise ConfigurationError(f"--seeds must be at least 1, got {count}.")
+    return list(range(count))
+
+
+def _question(initial: str, behavior: str, gamma: float | None) -> Question:
+    if initial not in ("reset", "data"):
+        raise ConfigurationError(f"--initial must be reset or data, got {initial!r}.")
+    if behavior not in ("clone", "logged"):
+        raise ConfigurationError(f"--behavior must be clone or logged, got {behavior!r}.")
+    if gamma is not None and not 0 < gamma <= 1:
+        raise ConfigurationError(f"--gamma must be above 0 and at most 1, got {gamma}.")
+    return Question(
+        initial="reset" if initial == "reset" else "data",
+        behavior="clone" if behavior == "clone" else "logged",
+        gamma=gamma,
+    )
+
+
+def _check_folder(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise ConfigurationError(f"--out must be a folder, and {str(folder)!r} is a file: give another name.")
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def _check_device(device: str) -> None:
+    import torch  # noqa: PLC0415  (slow to import)
+
+    try:
+        torch.zeros(1, device=device)
+    except (AssertionError, RuntimeError) as error:
+        raise ConfigurationError(f"--device {device!r} cannot be used here ({error}); try cpu.") from error
+
+
+def _tell_plan(plan: Plan, folder: Path) -> None:
+    out.print(f"Suite {plan.suite.name}: {plan.suite.about}")
+    for name, why in plan.missing.items():
+        out.print(f"  {name}: not measured. {why}", markup=False)
+    for name, why in plan.unknown_truth.items():
+        out.print(f"  {name}: no error can be computed. {why}", markup=False)
+    open_jobs = len(plan.open_jobs(folder))
+    out.print(
+        f"{plan.n_cells} cells in {len(plan.jobs)} jobs, {len(plan.jobs) - open_jobs} of them finished, in {folder}"
+    )
+
+
+@contextlib.contextmanager
+def _display(plan: Plan) -> Generator[Listener]:
+    """Give a listener that shows progress and the time left: a bar at a terminal, lines elsewhere."""
+    if not sys.stderr.isatty():
+        yield _print_line
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(plan.suite.name, total=len(plan.jobs))
+
+        def show(pace: Pace, report: JobReport | None) -> None:
+            text = f"{plan.suite.name}, {format_seconds(pace.seconds_left())} left"
+            bar.update(task, description=text, completed=len(pace.done), total=pace.total)
+
+        yield show
+
+
+def _print_line(pace: Pace, report: JobReport | None) -> None:
+    if report is None:
+        return
+    job, failed = report.job, sum(bool(reason) for _, reason in report.cells)
+    print(
+        f"{len(pace.done)}/{pace.total} {job.dataset} {job.variant.name} seed {job.seed}: "
+        f"{format_seconds(report.wall_seconds)}{f', {failed} cells failed' if failed else ''}; "
+        f"{format_seconds(pace.seconds_left())} left",
+        file=sys.stderr,
+        flush=True,
+    )
+
+
+def _tell_failures(reports: list[JobReport]) -> None:
+    reasons: dict[str, int] = {}
+    for report in reports:
+        for _, reason in report.cells:
+            if reason:
+                reasons[reason] = reasons.get(reason, 0) + 1
+    for reason, count in reasons.items():
+        out.print(f"{count} cells failed: {reason}", markup=False)
+
+
+def _finish(results: Results, folder: Path) -> None:
+    """Write tables and tidy files of a setting, and print what was found."""
+    setting = results.setting
+    where = folder / "tables" / f"{setting.budget}-{setting.initial}-{setting.behavior}"
+    analysis = Analysis(results)
+    if not results.cells:
+        return
+    write_tidy(results, where)
+    write_tables(all_tables(analysis), where)
+    known = analysis.with_truth()
+    if known:
+        out.print(f"Averages over {', '.join(results.families)} and {', '.join(known)}, {setting.describe()}:")
+        for line in best_sentences(analysis, ("all", known)):
+            out.print(f"  {line}")
+    out.print(f"Tables: {where}")

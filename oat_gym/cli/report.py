@@ -1,0 +1,26 @@
+"""`oat-gym report`: one self-contained HTML page of a folder of benchmark results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from oat_gym.benchmark.page import write_page
+from oat_gym.cli._shared import out
+from oat_gym.errors import ConfigurationError
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder that `oat-gym bench --out` wrote.")],
+    file: Annotated[Path | None, typer.Option("--out", help="The page; FOLDER/report.html without it.")] = None,
+) -> None:
+    """Make a page for readers who know the domain: what was mined, what was generated, did it help, how sure are we.
+
+    Pictures are inside the page, and it loads nothing from elsewhere.
+    """
+    if not folder.is_dir():
+        raise ConfigurationError(f"{str(folder)!r} is no folder of results: run `oat-gym bench --out {folder}` first.")
+    page = write_page(folder, file or folder / "report.html")
+    out.print(f"Report: {page}")

@@ -1,0 +1,194 @@
+"""From cells to tables, figures and the page: numbers that are known beforehand come out where they belong."""
+
+import math
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from oat_gym.benchmark import figures, paper
+from oat_gym.benchmark.analysis import Analysis
+from oat_gym.benchmark.page import make_page
+from oat_gym.benchmark.results import Results, Setting, cell_rows, estimate_rows, to_csv, write_tidy
+from oat_gym.benchmark.scores import METRICS
+from oat_gym.benchmark.store import CellResult, read_result, write_result
+from oat_gym.benchmark.story import sentence
+from oat_gym.benchmark.tables import all_tables, paper_table, write_tables
+from oat_gym.errors import CacheError, ConfigurationError
+
+POLICIES = tuple(f"p{number}" for number in range(7))
+TRUE = np.linspace(0.0, 600.0, 7)
+QUESTION = {"initial": "reset", "behavior": "clone", "gamma": None}
+
+
+def cell(
+    dataset: str, variant: str, family: str, seed: int, *, error: float, known: bool = True, reason: str = ""
+) -> CellResult:
+    """A cell whose estimates are off by `error`, give or take 1."""
+    rng = np.random.default_rng([seed, len(variant), len(family), int(error)])
+    values = TRUE + error + rng.normal(size=7)
+    return CellResult(
+        dataset=dataset, task="adroit-door", variant=variant, family=family, estimator=family, seed=seed, budget="full",
+        initial="reset (5 states)", policies=(*POLICIES[:6], "expert"), values=values,
+        replicates=values[:, None] + rng.normal(size=(7, 40)), true=TRUE if known else np.full(7, math.nan),
+        true_errors=np.zeros(7), reason=reason,
+        record={
+            "config": {"question": QUESTION}, "fingerprint": f"{dataset}{variant}{family}{seed}", "n_episodes": 25,
+            "finished": float(seed), "gamma": 0.995, "horizon": 200, "truth_note": "" if known else "Nobody knows.",
+            "environment": {"numpy": "2"}, "cost": {"cpu_seconds": 1.0, "wall_seconds": 2.0, "peak_memory_mb": 3.0},
+        },
+    )  # fmt: skip
+
+
+ERRORS = {"none": 100.0, "oat-paper": 40.0, "jittering": 100.0, "scaling": 220.0}
+
+
+def results_of(datasets: dict[str, bool], *, seeds: int = 3, extra: tuple[CellResult, ...] = ()) -> Results:
+    cells = [
+        cell(name, variant, family, seed, error=error, known=known)
+        for name, known in datasets.items()
+        for variant, error in ERRORS.items()
+        for family in ("FQE", "IS")
+        for seed in range(seeds)
+    ]
+    manifest = {
+        "question": QUESTION, "budget": {"name": "full"}, "datasets": [*datasets, "adroit-pen-human"],
+        "jobs_order": list(ERRORS), "missing": {"adroit-pen-human": "run `minari download D4RL/pen/human-v2`"},
+        "cells": [], "budget_line": "budget 'full'", "command": "oat-gym bench", "started": time.time(),
+    }  # fmt: skip
+    return Results(Setting("full", "reset", "clone", None), (*cells, *extra), (manifest,), ())
+
+
+@pytest.fixture(scope="module")
+def analysis() -> Analysis:
+    return Analysis(results_of({"adroit-door-human": True, "logs": False}))
+
+
+def test_verdicts_follow_the_errors(analysis: Analysis) -> None:
+    verdicts = {name: analysis.finding("adroit-door-human", name, "mean", "mae") for name in ERRORS if name != "none"}
+    assert {name: found.improvement.verdict for name, found in verdicts.items()} == {
+        "oat-paper": "helps", "jittering": "no evidence", "scaling": "hurts",
+    }  # fmt: skip
+    assert verdicts["oat-paper"].improvement.value == pytest.approx(60, abs=2)
+    assert "lowers the error by" in sentence(verdicts["oat-paper"], of="OAT")
+    assert sentence(verdicts["oat-paper"], of="OAT").endswith("helps.")
+    assert analysis.finding("logs", "oat-paper", "mean", "mae") is None
+    assert analysis.without_truth() == ("logs",)
+
+
+def test_a_family_that_failed_on_one_side_is_left_out_of_the_mean_of_both() -> None:
+    whole = results_of({"adroit-door-human": True})
+    kept = tuple(c for c in whole.cells if not (c.variant == "scaling" and c.family == "IS"))
+    found = Analysis(Results(whole.setting, kept, whole.manifests, ())).finding(
+        "adroit-door-human", "scaling", "mean", "mae"
+    )
+    assert found.families == ("FQE",)
+    assert found.improvement.before == pytest.approx(100, abs=2)
+
+
+def test_the_papers_numbers_stand_beside_ours(analysis: Analysis) -> None:
+    table = paper_table(analysis, "human", "mae")
+    rows = {(row[0], row[1]): dict(zip(table.header, row, strict=False)) for row in table.rows}
+    assert table.header[2:6] == ("pen", "paper", "door", "paper")
+    by_place = {(row[0], row[1]): row for row in table.rows}
+    oat = by_place["FQE", "OAT (oat-paper)"]
+    assert oat[4].startswith("40 ±") or float(oat[4].split()[0]) == pytest.approx(40, abs=1)
+    assert oat[4].endswith("+")
+    assert oat[5] == "255 ± 17"
+    assert oat[2] == "" and oat[3] == "540 ± 17"  # pen was not measured; the paper has it
+    assert by_place["FQE", "NoAug. (none)"][5] == "389 ± 60"
+    assert rows
+    assert paper_table(analysis, "expert", "mae") is None
+
+
+def test_the_papers_averages_agree_with_its_single_tables() -> None:
+    """Errors and regrets of table 2 are the means of tables 3, 5 and 6; the paper's claims follow from them."""
+    for metric in ("mae", "regret_at_1", "regret_at_5"):
+        for method in paper.METHODS:
+            for task in paper.TASKS:
+                single = [paper.printed("human", metric, each, method, task).mean for each in paper.ESTIMATORS]
+                assert paper.average("human", metric, method, task).mean == pytest.approx(np.mean(single), abs=0.01)
+    claims = {"pen": 71, "door": 36, "hammer": 45, "relocate": 76}
+    for task, percent in claims.items():
+        before, after = (paper.average("human", "mae", method, task).mean for method in ("NoAug.", "OAT"))
+        assert 100 * (before - after) / before == pytest.approx(percent, abs=0.6)
+    with pytest.raises(ConfigurationError, match="no"):
+        paper.printed("human", "mae", "FQE", "magic", "door")
+
+
+def test_all_tables_are_written_and_hold_what_they_say(analysis: Analysis, tmp_path: Path) -> None:
+    tables = all_tables(analysis)
+    names = {table.name for table in tables}
+    assert {"table-02", "table-03", "table-04", "improvements", "dataset-adroit-door-human"} <= names
+    assert "table-01-adroit-door-human" in names  # one of the policies is called expert
+    for table in tables:
+        assert all(len(row) == len(table.header) for row in table.rows)
+        assert "3 seeds" in table.caption or table.name.startswith(("improvements", "table-01"))
+    paths = write_tables(tables, tmp_path)
+    assert (tmp_path / "tables.md") in paths
+    assert "Table 3." in (tmp_path / "tables.md").read_text()
+
+
+def test_tidy_rows_keep_every_number(analysis: Analysis, tmp_path: Path) -> None:
+    results = analysis.results
+    rows = estimate_rows(results)
+    assert len(rows) == 7 * len(results.cells)
+    first = results.cells[0]
+    assert rows[0]["value"] == first.values[0]
+    assert rows[0]["low"] < rows[0]["value"] < rows[0]["high"]
+    by_cell = cell_rows(results)
+    assert by_cell[0]["mae"] == pytest.approx(np.abs(first.values - TRUE).mean())
+    assert all(math.isnan(row["mae"]) for row in by_cell if row["dataset"] == "logs")
+    assert "NaN" not in to_csv(by_cell) and "nan" not in to_csv(by_cell).split("\n", 1)[1]
+    paths = {path.name for path in write_tidy(results, tmp_path)}
+    assert {"estimates.csv", "cells.csv", "estimates.parquet", "cells.parquet"} <= paths
+    pq = pytest.importorskip("pyarrow.parquet")
+    assert pq.read_table(tmp_path / "estimates.parquet").num_rows == len(rows)
+
+
+def test_the_page_says_it_all_and_loads_nothing(analysis: Analysis) -> None:
+    failed = cell("adroit-door-human", "oat-paper", "IS", 9, error=0, reason="TrainingError: <diverged>")
+    page = make_page((Analysis(results_of({"adroit-door-human": True, "logs": False}, extra=(failed,))).results,))
+    assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)""", page)
+    assert "<script" not in page
+    assert "url(" not in page
+    assert "minari download D4RL/pen/human-v2" in page
+    assert "No error can be computed here" in page
+    assert "Nobody knows." in page
+    assert "&lt;diverged&gt;" in page  # what cells say is text, never markup
+    for word in ("helps", "hurts", "no evidence"):
+        assert word in page
+
+
+def test_one_seed_is_said_to_be_no_evidence() -> None:
+    page = make_page((results_of({"adroit-door-human": True}, seeds=1),))
+    assert "One seed cannot tell" in page
+    assert 'class="good"' not in page
+
+
+def test_a_cell_comes_back_as_it_was_and_damage_is_seen(tmp_path: Path) -> None:
+    one, path = cell("logs", "none", "IS", 0, error=3.0), tmp_path / "a" / "cell.safetensors"
+    write_result(path, one)
+    again = read_result(path)
+    np.testing.assert_array_equal(again.values, one.values)
+    np.testing.assert_allclose(again.replicates, one.replicates, rtol=1e-6)
+    assert again.record == one.record
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(CacheError, match="damaged"):
+        read_result(path)
+
+
+def test_bars_draw_what_was_measured(analysis: Analysis) -> None:
+    names = [name for name in ERRORS if name != "none"]
+    changes = [analysis.finding("adroit-door-human", name, "mean", "mae").improvement for name in names]
+    panels = [figures.Panel("error", "percent", names, [*changes[:2], None], [10.0, math.nan, math.nan])]
+    drawn = figures.improvement_bars(panels, title="x")
+    axes = drawn.axes[0]
+    assert [patch.get_width() for patch in axes.patches] == pytest.approx([change.value for change in changes[:2]])
+    assert any("not measured" in text.get_text() for text in axes.texts)
+    assert figures.to_png(drawn).startswith(b"\x89PNG")
+    with pytest.raises(ConfigurationError, match="at least one panel"):
+        figures.improvement_bars([], title="x")
+    assert "mae" in METRICS

@@ -1,0 +1,70 @@
+"""`oat-gym bench` and `oat-gym report` as their user meets them."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from oat_gym import cli, domains
+from oat_gym.benchmark import budget, protocol
+from oat_gym.errors import ConfigurationError, DatasetNotFoundError
+from tests.benchmark import tiny
+
+
+@pytest.fixture
+def tiny_suite(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Add the domain of the tests to the installed ones, and its suite."""
+    monkeypatch.setattr(domains, "DATASETS", {**domains.DATASETS, **tiny.CATALOG.datasets})
+    monkeypatch.setattr(domains, "TASKS", {**domains.TASKS, **tiny.CATALOG.tasks})
+    monkeypatch.setitem(protocol.SUITES, "line", tiny.SUITE)
+    monkeypatch.setitem(budget.BUDGETS, "full", tiny.BUDGET)
+
+
+@pytest.mark.usefixtures("tiny_suite")
+def test_a_suite_runs_resumes_and_becomes_a_page(tmp_path: Path) -> None:
+    arguments = ["bench", "--suite", "line", "--augmenters", "jittering", "--seeds", "2", "--out", str(tmp_path)]
+    first = CliRunner().invoke(cli.app, arguments, catch_exceptions=False)
+    assert first.exit_code == 0
+    assert "line-human: not measured. D4RL/line/human-v2 is not here" in first.output
+    assert "8 cells in 4 jobs, 0 of them finished" in first.output
+    assert "jittering" in first.output
+    assert "the error by" in first.output
+    again = CliRunner().invoke(cli.app, arguments, catch_exceptions=False)
+    assert "4 of them finished" in again.output
+    assert list(tmp_path.glob("tables/*/tables.md"))
+    assert list(tmp_path.glob("tables/*/cells.csv"))
+    made = CliRunner().invoke(cli.app, ["report", str(tmp_path), "--out", str(tmp_path / "page.html")])
+    assert made.exit_code == 0
+    page = (tmp_path / "page.html").read_text()
+    assert "minari download D4RL/line/human-v2" in page
+    assert "What was generated" in page
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--suite", "magic"], "no suite 'magic'"),
+        (["--augmenters", "magic"], "no variant 'magic'"),
+        (["--estimators", "magic"], "no estimator magic"),
+        (["--seeds", "0"], "--seeds must be"),
+        (["--seeds", "2", "--seed", "1"], "not both"),
+        (["--initial", "somewhere"], "--initial must be"),
+        (["--behavior", "magic"], "--behavior must be"),
+        (["--gamma", "2"], "--gamma must be"),
+        (["--device", "magic"], "--device 'magic'"),
+    ],
+)
+def test_bad_input_is_named(arguments: list[str], message: str, tmp_path: Path) -> None:
+    result = CliRunner().invoke(cli.app, ["bench", *arguments, "--out", str(tmp_path)])
+    assert isinstance(result.exception, ConfigurationError)
+    assert message in str(result.exception)
+
+
+def test_nothing_at_hand_and_nothing_to_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(protocol.SUITES, "none", protocol.Suite("none", ("nowhere",), "nothing"))
+    result = CliRunner().invoke(cli.app, ["bench", "--suite", "none", "--out", str(tmp_path)])
+    assert isinstance(result.exception, DatasetNotFoundError)
+    assert "nowhere" in result.output
+    result = CliRunner().invoke(cli.app, ["report", str(tmp_path)])
+    assert isinstance(result.exception, ConfigurationError)
+    assert "oat-gym bench" in str(result.exception)
