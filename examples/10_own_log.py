@@ -30,14 +30,9 @@ def made_up_log(students: int, decisions: int, seed: int) -> pd.DataFrame:
         for place in range(decisions):
             hint = int(rng.random() < 0.4)
             gain = (0.15 * (1 - skill) if hint else 0.05) * rng.uniform(0.5, 1.5)
-            row = {
-                "student": student,
-                "place": place,
-                "minute": 5.0 * place,
-                "skill": skill,
-                "tired": place / decisions,
-            }
-            rows.append(row | {"hint": hint, "p_taken": 0.4 if hint else 0.6, "reward": gain - 0.02 * hint})
+            row = {"student": student, "place": place, "minute": 5.0 * place, "skill": skill}
+            row |= {"tired": place / decisions, "hint": hint, "p_taken": 0.4 if hint else 0.6}
+            rows.append(row | {"reward": gain - 0.02 * hint})
             skill = min(skill + gain, 1.0)
     return pd.DataFrame(rows)
 
