@@ -18,7 +18,7 @@ from pathlib import Path
 import minari
 import numpy as np
 import numpy.typing as npt
-from adroit_texts import ABOUT, CARD, CLONES_DOOR, CLONES_OTHER, HUMAN_DOOR, HUMAN_OTHER
+from adroit_texts import ABOUT, CARD, CLONES_DOOR, CLONES_OTHER, HUMAN_DOOR, HUMAN_OTHER, REMARKS
 from matplotlib.figure import Figure
 
 from oat_gym import OAT, AugmentedDataset, domains, plots
@@ -178,6 +178,7 @@ def write_card(task: str, *, augment: list[str], out: Path) -> None:
         versions=", ".join(f"{name} {version}" for name, version in truth.versions.items()),
         command=truth.command,
         note=truth.note,
+        remark=REMARKS.get(task, ""),
         arguments=f"--tasks {task}" + (f" --augment {' '.join(augment)}" if augment else ""),
     )
     (folder / "README.md").write_text(text)
