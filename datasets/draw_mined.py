@@ -52,7 +52,7 @@ DRAWINGS = {
     ),
     "icu-sepsis-features": Drawing(
         "icu-sepsis",
-        columns_of(tuple(f"feature {number}" for number in range(10)), 0),  # its authors do not name them
+        columns_of(tuple(f"feature {number}" for number in range(10)), 0),
         OAT(mining=MiningConfig(n_clusters=10, length=5)),
     ),
     "sepsis-mdp-features": Drawing(

@@ -86,8 +86,10 @@ def categories(sizes: tuple[int, ...]) -> View:
     return View(spaces.MultiDiscrete(list(sizes)), observe, recover)
 
 
-def centres(points: FloatArray) -> View:
+def centres(points: FloatArray, *, known: int | None = None) -> View:
     """Return the view of states as the rows of `points` (S, D), recovered as the nearest row (Euclidean).
+
+    Only the first `known` rows are recovered: the others stand for no place (ends, which show as zeros).
 
     >>> view = centres(np.array([[0.0, 0.0], [1.0, 1.0]]))
     >>> view.recover(np.array([[0.9, 0.7]])).tolist()
@@ -99,7 +101,7 @@ def centres(points: FloatArray) -> View:
 
     def recover(observations: Batch) -> IntArray:
         rows = np.asarray(observations, dtype=np.float64)
-        parts = [_nearest(rows[start : start + _ROWS], points) for start in range(0, len(rows), _ROWS)]
+        parts = [_nearest(rows[start : start + _ROWS], points[:known]) for start in range(0, len(rows), _ROWS)]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     return View(spaces.Box(-np.inf, np.inf, points.shape[1:], np.float64), observe, recover)

@@ -31,6 +31,7 @@ from oat_gym.ope.policies import CategoricalPolicy, EpsilonGreedyPolicy, check_d
 from oat_gym.spaces import Batch, FlatSpace
 
 FloatArray = npt.NDArray[np.float64]
+VERSION = 1  # raise it when training changes, so that no cached network of an older one is used
 EVALUATION_EPSILON = 0.05
 """Mnih et al. evaluate their networks with this share of random actions."""
 

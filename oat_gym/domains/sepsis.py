@@ -18,10 +18,12 @@ from collections.abc import Callable, Mapping
 import minari
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from oat_gym.cache import CacheEntry, fingerprint
+from oat_gym.domains import dqn
 from oat_gym.domains.dqn import DQN, QNetwork
-from oat_gym.domains.sepsis_clif import ACTION_SPACE, OBSERVATION_SPACE, VERSION, convert, train_test
+from oat_gym.domains.sepsis_clif import ACTION_SPACE, OBSERVATION_SPACE, TRAIN_SHARE, VERSION, convert, train_test
 from oat_gym.domains.sepsis_clif import DATASETS as _DATASETS
 from oat_gym.domains.sepsis_stages import SHOCK
 from oat_gym.domains.sepsis_tables import Tables, find_tables
@@ -94,7 +96,16 @@ def shock_curves(dataset: minari.MinariDataset, targets: Mapping[str, Policy]) -
 
 def _network(tables: Tables, content: str, settings: DQN, *, seed: int) -> QNetwork:
     """Return a network from the cache, trained on the training split where it is not there."""
-    key = fingerprint(domain="sepsis-clif", content=content, version=VERSION, settings=settings, seed=seed)
+    key = fingerprint(
+        domain="sepsis-clif",
+        content=content,
+        version=VERSION,
+        training=dqn.VERSION,
+        share=TRAIN_SHARE,
+        torch=torch.__version__,
+        settings=settings,
+        seed=seed,
+    )
     entry = CacheEntry(key)
     with entry.lock():
         found = entry.read(_NETWORK)

@@ -1,7 +1,7 @@
 """Two finite models of sepsis with exact values: ICU-Sepsis, and Oberst and Sontag's simulator as a table.
 
 ICU-Sepsis (Choudhary et al., "ICU-Sepsis: a benchmark MDP built from real medical data", RLC 2024) has 716 states,
-clusters of MIMIC-III patients, and 25 actions, five levels of vasopressors by five of fluids. Surviving earns 1.
+clusters of MIMIC-III patients, and 25 actions, five levels of fluids by five of vasopressors. Surviving earns 1.
 Oberst and Sontag's process ("Counterfactual off-policy evaluation with Gumbel-max structural causal models", ICML
 2019) has 1,440 states of eight categories and 8 actions, antibiotics x ventilation x vasopressors. Discharge earns 1,
 death -1.
@@ -217,7 +217,7 @@ def _read_icu(source: Path) -> SepsisModel:
             "worst-clinicians": mixture(worst, clinicians, 0.5),
             "worst": worst,
         },
-        features=views.centres(np.asarray(arrays["state_cluster_centers"], dtype=np.float64)),
+        features=views.centres(np.asarray(arrays["state_cluster_centers"], dtype=np.float64), known=_DEATH),
     )
 
 

@@ -80,6 +80,8 @@ def episodes_from_table(  # noqa: PLR0917  (the columns are part of the data)
     if consecutive is None:
         consecutive = position.dtype.kind in "iu"
     parts = _sorted_rows(ids, position, names=(episode, order), consecutive=consecutive)
+    if time is not None:
+        _check_times(extras["time"], ids, parts, name=time)
     _check_ends(ids, steps["ended"], parts, from_column=isinstance(terminated, str))
     return [_episode(ids[part[0]], _take(steps, part), _take(extras, part)) for part in parts]
 
@@ -99,6 +101,11 @@ def _ends(table: Table, terminated: bool | str, rows: int) -> npt.NDArray[np.boo
 
 
 def _info_columns(table: Table, infos: Sequence[str], propensity: str | None, time: str | None) -> dict[str, Array]:
+    for name, made_of in (("log_prob", propensity), ("time", time)):
+        if name in infos and made_of not in (None, name):
+            raise ConfigurationError(
+                f"infos would hold {name!r} twice: that column, and what is made of {made_of!r}. Rename one."
+            )
     columns = {name: _numbers(table, name) for name in infos}
     if propensity is not None:
         columns["log_prob"] = _log_probabilities(table, propensity)
@@ -107,13 +114,22 @@ def _info_columns(table: Table, infos: Sequence[str], propensity: str | None, ti
     return columns
 
 
+def _check_times(times: Array, ids: Array, parts: Sequence[Array], *, name: str) -> None:
+    for part in parts:
+        back = np.flatnonzero(np.diff(times[part]) < 0)
+        if len(back):
+            before, after = times[part][back[0] : back[0] + 2]
+            raise InvalidDataError(
+                f"Column {name!r} goes back from {before} to {after} in episode {ids[part[0]]!r}; times must not "
+                "decrease in the order of the rows. Correct them, or order the rows by them."
+            )
+
+
 def _column(table: Table, name: str) -> Array:
-    try:
-        values = table[name]
-    except (KeyError, IndexError, ValueError) as error:
-        raise ConfigurationError(
-            f"The table has no column {name!r}; its columns are {_column_names(table)}."
-        ) from error
+    names = _column_names(table)
+    if name not in names:
+        raise ConfigurationError(f"The table has no column {name!r}; its columns are {names}.")
+    values = table[name]
     if getattr(getattr(values, "dtype", None), "tz", None) is not None:  # pandas would give objects; in UTC
         array = values.to_numpy(dtype="datetime64[ns]")
     else:
@@ -124,8 +140,11 @@ def _column(table: Table, name: str) -> Array:
 
 
 def _column_names(table: Any) -> list[str]:
-    names = getattr(table, "column_names", None)
-    return [str(name) for name in (table if names is None else names)]
+    """Return the names of the columns of a pyarrow table, a frame, a structured array or a mapping."""
+    for names in (getattr(table, "column_names", None), getattr(getattr(table, "dtype", None), "names", None)):
+        if names is not None:
+            return list(names)
+    return list(getattr(table, "columns", table))
 
 
 def _numbers(table: Table, name: str) -> Array:

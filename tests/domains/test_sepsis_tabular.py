@@ -99,6 +99,15 @@ def test_icu_sepsis_has_the_published_values(shared_data):
 
 
 @pytest.mark.shared_data
+def test_no_observation_is_taken_for_an_end(shared_data):
+    view = sepsis_tabular.sepsis_model("icu-sepsis", shared_data).view(True)
+    everything = np.asarray(view.observe(np.arange(716)))
+    assert not everything[713:].any(), "ends show as zeros, the average patient"
+    np.testing.assert_array_equal(view.recover(everything[:713]), np.arange(713))
+    assert (view.recover(np.concatenate([everything, 0.5 * everything])) < 713).all()
+
+
+@pytest.mark.shared_data
 def test_the_simulators_rules_say_where_the_published_process_is_rewarded(shared_data):
     with np.load(shared_data / sepsis_tabular.MDP_FILE, allow_pickle=False) as file:
         index, values = file["r_idx"], file["r_val"]

@@ -48,6 +48,36 @@ def test_terminated_episodes_keep_all_rows_and_repeat_the_last_observation(shuff
         np.testing.assert_array_equal(episode.infos["p"], 1 / (t + 2))
 
 
+def test_times_that_go_back_are_named():
+    table = make_table() | {"clock": np.array([0, 1, 2, 0, 5, 4, 6, 7, 0, 1])}
+    assert episodes_from_table(table, **ROLES, time="t")
+    with pytest.raises(InvalidDataError, match=r"'clock' goes back from 5 to 4 in episode .*9"):
+        episodes_from_table(table, **ROLES, time="clock")
+
+
+def test_an_info_is_not_silently_replaced():
+    table = make_table() | {"time": make_table()["t"] + 1, "log_prob": make_table()["p"]}
+    found = episodes_from_table(table, **ROLES, infos=["time"], time="time")
+    assert found[0].infos["time"].tolist() == [11, 12, 13]
+    for clash in ({"infos": ["time"], "time": "t"}, {"infos": ["log_prob"], "propensity": "p"}):
+        with pytest.raises(ConfigurationError, match="twice: that column"):
+            episodes_from_table(table, **ROLES, **clash)
+
+
+class Strict(dict):
+    """A frame whose missing columns raise an error of its own, as polars does."""
+
+    def __missing__(self, key):
+        raise RuntimeError(key)
+
+
+def test_a_missing_column_is_named_whatever_the_table_raises():
+    records = np.array([(1, 0, 0.0, 0, 0.0)], dtype=[(name, float) for name in ("id", "t", "x", "y", "a")])
+    for table in (Strict({name: values for name, values in make_table().items() if name != "r"}), records):
+        with pytest.raises(ConfigurationError, match=r"no column 'r'; its columns are \['id', 't', 'x', 'y', 'a'"):
+            episodes_from_table(table, **ROLES)
+
+
 @pytest.mark.parametrize("shuffle", [None, 3])
 def test_cut_off_episodes_end_in_the_last_recorded_observation(shuffle):
     found = episodes_from_table(make_table(shuffle=shuffle), **ROLES, terminated=False, infos=["t"])
