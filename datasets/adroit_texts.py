@@ -70,13 +70,14 @@ and what OAT puts in their place.
 - Size: {steps} steps, those of D4RL's human data, as in the paper. The last episode is cut where that is reached.
 - Rewards are D4RL's. The installed environment's, in `infos["stock_reward"]`, *add* 0.1 times the distance from hand to
   object where D4RL subtracts it (door, hammer, relocate; gymnasium-robotics since 1.2.1, mended in `-v2`).
-  Which of the two Minari's own D4RL data carries was not known when this was written;
-  `oat_gym.domains.adroit_rewards.reward_convention` tells it for door and relocate, and `domains.load` warns.
+  Which of the two Minari's own D4RL data carries was not known when this was written: `domains.load` tells it for door
+  and relocate, and converts the environment's into D4RL's.
 - Episodes never terminate: the environment has no terminal states (D4RL's pen ends an episode when the pen drops).
 - Actions are recorded as clipped to [-1, 1], as the environment clips them (and D4RL's own data does).
   `infos["log_prob"]` (expert, cloned-from-expert) is the log-probability of the *clipped* action: an entry on a bound
   has the probability that clipping puts there. The target policies' `log_prob` is of the same kind.
-- Each made episode's `seed` metadata resets the environment to its start, from which its actions replay it exactly.
+- A roll-out's `seed` metadata resets the environment to its start, from which its actions replay it exactly (the
+  demonstrations in cloned data have none).
 {clones}
 
 ## True values

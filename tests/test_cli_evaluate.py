@@ -72,7 +72,7 @@ def test_augmented_episodes_are_paired_and_the_truth_is_compared(
 
 
 def test_a_dataset_of_no_task_needs_policies(walk_dataset: minari.MinariDataset) -> None:
-    with pytest.raises(ConfigurationError, match="no task named 'test/walks-v0'"):
+    with pytest.raises(ConfigurationError, match=r"no task named 'test/walks-v0'.*Give --policies"):
         evaluate()
 
 
@@ -95,6 +95,35 @@ def test_the_policies_and_values_of_a_task(
     assert by_dataset == by_name
     assert "mae" in by_dataset
     assert "mae" not in shorter, "values of 6 steps are no truth for 5"
+    with pytest.raises(ConfigurationError, match="--initial reset is for policies of a task with an environment"):
+        evaluate("--initial", "reset")
+    with pytest.raises(ConfigurationError, match="gamma must be"):
+        evaluate("--gamma", "0")
+
+
+def test_estimates_are_kept_where_no_true_value_is_known(
+    walk_dataset: minari.MinariDataset, policies: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    known = ope.load_dope_policies(policies, action_space=walk_dataset.action_space)  # type: ignore[arg-type]
+    starts: list[int] = []
+
+    def resets(count: int, seed: int) -> np.ndarray:
+        starts.append(count)
+        return np.zeros((count, 2))
+
+    def nothing(gamma: float) -> domains.Truth:
+        raise ConfigurationError(f"nothing is stored for {gamma}")
+
+    task = domains.Task(("test/walks-v0",), lambda: {**known}, truth=nothing, initial_states=resets, horizon=6)
+    monkeypatch.setitem(domains.TASKS, "walks", task)
+    with pytest.warns(EstimationWarning):
+        printed = evaluate("--gamma", "0.97", "--initial", "reset", "--out", str(tmp_path / "values.csv"))
+    assert "Not compared with true values: nothing is stored for 0.97" in printed
+    assert len((tmp_path / "values.csv").read_text().splitlines()) == 3
+    assert starts == [200]
+    (tmp_path / "truth.csv").write_text("policy,value\nwalk_0,1.0\n")
+    with pytest.raises(InvalidDataError, match="true values has none of walk_1"):
+        evaluate("--truth", str(tmp_path / "truth.csv"))
 
 
 @pytest.mark.parametrize(

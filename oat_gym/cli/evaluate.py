@@ -18,9 +18,11 @@ from oat_gym.augmenters import AUGMENTERS
 from oat_gym.cache import write_atomically
 from oat_gym.cli._shared import Dataset, Factor, Seed, find_augmenter, open_source, out
 from oat_gym.dataset import AugmentedDataset
-from oat_gym.errors import ConfigurationError, InvalidDataError
+from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError
 from oat_gym.progress import progress_bar
+from oat_gym.spaces import Batch
 
+_RESETS = 200
 _PARTS: dict[str, ope.UseAugmented] = {"training": None, "all": "all", "none": "none"}
 
 
@@ -42,6 +44,9 @@ def evaluate(
     ] = "training",
     behavior: Annotated[str, typer.Option(help="Behaviour policy: clone, or logged (infos['log_prob']).")] = "clone",
     truth: Annotated[Path | None, typer.Option(help="CSV of true values, columns policy and value.")] = None,
+    initial: Annotated[
+        str, typer.Option(help="Where values count from: data (its first states), or reset (the task's environment).")
+    ] = "data",
     file: Annotated[Path | None, typer.Option("--out", help="CSV file for every estimate.")] = None,
 ) -> None:
     """Estimate what each policy would earn, from the episodes of DATASET.
@@ -55,11 +60,17 @@ def evaluate(
         raise ConfigurationError(f"--use-augmented must be one of {', '.join(_PARTS)}, got {use_augmented!r}.")
     if behavior not in ("clone", "logged"):
         raise ConfigurationError(f"--behavior must be clone or logged, got {behavior!r}.")
+    if initial not in ("data", "reset"):
+        raise ConfigurationError(f"--initial must be data or reset, got {initial!r}.")
     given = None if truth is None else read_truth(truth)
     data = _data(dataset, augmenter, factor, seed)
     targets, task = _targets(policies, dataset, data)
-    gamma = gamma or (task.gamma if task else 0.995)
-    horizon = horizon or (task.horizon if task else None)
+    if gamma is None:
+        gamma = task.gamma if task else 0.995
+    if horizon is None and task:
+        horizon = task.horizon
+    starts = _initial_states(task) if initial == "reset" else None
+    known = _known(given, task, list(targets), gamma=gamma, horizon=horizon)
     with progress_bar() as progress:
         if isinstance(data, AugmentedDataset):
             data.fit(progress=progress)
@@ -71,6 +82,7 @@ def evaluate(
             horizon=horizon,
             seeds=seeds,
             behavior=behavior,
+            initial_states=starts,
             use_augmented=_PARTS[use_augmented],
             paired=isinstance(data, AugmentedDataset) and use_augmented != "none",
             progress=progress,
@@ -82,15 +94,45 @@ def evaluate(
     if result.question.paired:
         out.print("Change by the synthetic episodes:")
         _print_rows(result.differences, ("policy", "estimator", "seed", "difference", "standard_error", "low", "high"))
-    known = given or (task.truth(gamma) if task and task.truth and horizon == task.horizon else None)
+    if file is not None:
+        write_atomically(file, to_csv(result.rows).encode())
+        out.print(f"Every estimate: {file}")
     if known is not None:
+        if initial == "data" and task and task.initial_states:
+            out.print("True values count from the environment's resets, estimates from the data's first states.")
         _print_rows(
             result.compare(known),
             ("estimator", "data", "seed", "mae", "rank_correlation", "regret_at_1", "regret_at_5"),
         )
-    if file is not None:
-        write_atomically(file, to_csv(result.rows).encode())
-        out.print(f"Every estimate: {file}")
+
+
+def _initial_states(task: domains.Task | None) -> Batch:
+    if task is None or task.initial_states is None:
+        raise ConfigurationError("--initial reset is for policies of a task with an environment; leave it out.")
+    return task.initial_states(_RESETS, 0)
+
+
+def _known(
+    given: dict[str, float] | None,
+    task: domains.Task | None,
+    policies: list[str],
+    *,
+    gamma: float,
+    horizon: int | None,
+) -> dict[str, float] | domains.Truth | None:
+    """Return the true values to compare with, before anything is computed; None where there are none."""
+    if given is not None:
+        missing = [name for name in policies if name not in given]
+        if missing:
+            raise InvalidDataError(f"The file of true values has none of {', '.join(missing)}.")
+        return given
+    if task is None or task.truth is None or horizon != task.horizon:
+        return None
+    try:
+        return task.truth(gamma)
+    except (ConfigurationError, DatasetNotFoundError) as error:
+        out.print(f"Not compared with true values: {error}", markup=False)
+        return None
 
 
 def read_truth(path: Path) -> dict[str, float]:
@@ -142,7 +184,10 @@ def _targets(
 ) -> tuple[dict[str, ope.Policy], domains.Task | None]:
     """Return the target policies, and the task that they are of."""
     if policies is None or policies in domains.TASKS:
-        task = domains.task(dataset if policies is None else policies)
+        try:
+            task = domains.task(dataset if policies is None else policies)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{error} Give --policies: one of these, or a folder of weight files.") from error
         return task.policies(), task
     if not isinstance(data.action_space, spaces.Box):
         raise ConfigurationError(

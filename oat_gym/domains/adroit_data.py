@@ -164,7 +164,7 @@ def demonstration_buffer(episode: EpisodeData, task: AdroitTask) -> EpisodeBuffe
     """Return a demonstration as roll-outs are recorded: clipped actions, D4RL's rewards, the stock ones in infos."""
     following = np.asarray(episode.observations, dtype=np.float64)[1:]
     rewards = np.asarray(episode.rewards, dtype=np.float64)
-    infos: dict[str, npt.NDArray[Any]] = dict(episode.infos or {})
+    infos = {name: _of_steps(rows, len(rewards)) for name, rows in (episode.infos or {}).items() if _is_flat(rows)}
     if "stock_reward" not in infos:
         if reward_convention(rewards, following, task) == "stock":
             rewards = d4rl_reward(rewards, following, task)
@@ -177,6 +177,15 @@ def demonstration_buffer(episode: EpisodeData, task: AdroitTask) -> EpisodeBuffe
         truncations=episode.truncations,
         infos=infos,
     )
+
+
+def _is_flat(rows: object) -> bool:
+    return isinstance(rows, np.ndarray)
+
+
+def _of_steps(rows: npt.NDArray[Any], steps: int) -> npt.NDArray[Any]:
+    """Return an info's T rows, as `roll_out` records them: the reset's, which Minari has, is left out."""
+    return rows[1:] if len(rows) == steps + 1 else rows
 
 
 def _fitting(episodes: Sequence[EpisodeBuffer], steps: int) -> Sequence[EpisodeBuffer]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+import zipfile
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -15,9 +16,17 @@ import numpy.typing as npt
 from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
-from oat_gym.domains._data import converted, find_file
+from oat_gym.domains._data import converted, find_file, generated
 from oat_gym.domains.adroit_env import REQUIREMENTS, env_spec
-from oat_gym.domains.adroit_rewards import AdroitTask, Convention, RewardWarning, adroit_task, reward_convention
+from oat_gym.domains.adroit_rewards import (
+    AdroitTask,
+    Convention,
+    RewardWarning,
+    adroit_task,
+    d4rl_reward,
+    reward_convention,
+)
+from oat_gym.episodes import content_hash
 from oat_gym.errors import DatasetNotFoundError, InvalidDataError
 from oat_gym.io.writing import DatasetCard, dataset_from_episodes, episode_buffer
 
@@ -43,28 +52,33 @@ _DESCRIPTION = (
 def human(name: str) -> minari.MinariDataset:
     """Return the 25 human demonstrations of a task ("pen", "door", "hammer", "relocate").
 
-    They are Minari's own `D4RL/TASK/human-v2` where it is installed (`dataset.id` tells), as it is; the door's are
-    otherwise converted from the file that they were published in (`door_human`).
+    They are Minari's own `D4RL/TASK/human-v2` where it is installed (`dataset.id` tells); the door's are otherwise
+    converted from the file that they were published in (`door_human`). Where Minari's data carries the installed
+    environment's rewards (`reward_convention`), a copy with D4RL's, which the true values count, is made in the cache;
+    the others are in its `infos["stock_reward"]`.
 
     Raises:
         ConfigurationError: for an unknown task.
         DatasetNotFoundError: if the data is not there; the message says how to get it.
 
     Warns:
-        RewardWarning: if Minari's data carries the installed environment's rewards (`reward_convention`), which are
-            not what the true values count.
+        RewardWarning: if rewards were converted, or if nobody can tell which rewards Minari's data carries (the
+            hammer's cannot be computed from observations).
     """
     task = adroit_task(name)
     dataset = door_human() if name == "door" else _from_minari(name)
-    if dataset.id == _minari_id(name) and _convention(dataset, task) == "stock":
-        warnings.warn(
-            f"{dataset.id} carries rewards that add 0.1 x the distance from hand to object; the true values of "
-            f"'adroit-{name}' count D4RL's, which subtract it: d4rl_reward(rewards, observations[1:], "
-            f"ADROIT[{name!r}]) of oat_gym.domains.adroit_rewards gives these.",
-            RewardWarning,
-            stacklevel=2,
-        )
-    return dataset
+    convention = _convention(dataset, task) if dataset.id == _minari_id(name) else "d4rl"
+    if convention == "d4rl":
+        return dataset
+    found = "carries rewards that add" if convention == "stock" else "may carry rewards that add"
+    done = "converted to these" if convention == "stock" else "given as they are, since nobody can tell from the data"
+    warnings.warn(
+        f"{dataset.id} {found} 0.1 x the distance from hand to object; the true values of 'adroit-{name}' count "
+        f"D4RL's, which subtract it. Rewards are {done}.",
+        RewardWarning,
+        stacklevel=2,
+    )
+    return _with_d4rl_rewards(dataset, task) if convention == "stock" else dataset
 
 
 def door_human(path: str | os.PathLike[str] | None = None) -> minari.MinariDataset:
@@ -112,6 +126,37 @@ def _convention(dataset: minari.MinariDataset, task: AdroitTask) -> Convention:
     return reward_convention(np.concatenate([episode.rewards for episode in episodes]), following, task)
 
 
+def _with_d4rl_rewards(dataset: minari.MinariDataset, task: AdroitTask) -> minari.MinariDataset:
+    def converted_episode(episode: minari.EpisodeData) -> EpisodeBuffer:
+        return episode_buffer(
+            observations=episode.observations,
+            actions=episode.actions,
+            rewards=d4rl_reward(episode.rewards, np.asarray(episode.observations)[1:], task),
+            terminations=episode.terminations,
+            truncations=episode.truncations,
+            infos={**(episode.infos or {}), "stock_reward": episode.rewards},
+        )
+
+    def write(folder: Path) -> minari.MinariDataset:
+        return dataset_from_episodes(
+            map(converted_episode, dataset.iterate_episodes()),
+            directory=folder,
+            card=DatasetCard(
+                dataset_id=f"oat_gym/{task.name}-human-v0",
+                description=f"{dataset.id} with D4RL's rewards; infos['stock_reward'] has those of the source.",
+                author="Aravind Rajeswaran et al. (hand_dapg)",
+                algorithm_name="human demonstrations",
+                env_spec=dataset.env_spec,
+                requirements=REQUIREMENTS,
+            ),
+            observation_space=dataset.observation_space,
+            action_space=dataset.action_space,
+        )
+
+    content = content_hash(dataset.iterate_episodes())
+    return generated(write, domain=f"adroit-{task.name}-human", content=content, version=_VERSION)
+
+
 def _convert(source: Path, folder: Path) -> minari.MinariDataset:
     spec = env_spec("door")
     return dataset_from_episodes(
@@ -133,11 +178,15 @@ def _convert(source: Path, folder: Path) -> minari.MinariDataset:
 
 def _read_demonstrations(source: Path) -> list[EpisodeBuffer]:
     names = ("observations", "actions", "rewards", "lengths")
-    with np.load(source, allow_pickle=False) as file:
-        missing = [name for name in names if name not in file]
-        if missing:
-            raise InvalidDataError(f"{source} lacks the arrays {missing}; it has {sorted(file)}. {_DOOR_HOW_TO_GET}")
-        observations, actions, rewards, lengths = (file[name] for name in names)
+    try:
+        with source.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file}
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise InvalidDataError(f"{source} cannot be read as plain arrays ({error}). {_DOOR_HOW_TO_GET}") from error
+    missing = [name for name in names if name not in arrays]
+    if missing:
+        raise InvalidDataError(f"{source} lacks the arrays {missing}; it has {sorted(arrays)}. {_DOOR_HOW_TO_GET}")
+    observations, actions, rewards, lengths = (arrays[name] for name in names)
     rows = int(lengths.sum())
     if not rows == len(observations) == len(actions) == len(rewards):
         raise InvalidDataError(f"{source}: lengths sum to {rows}, and there are {len(observations)} observations.")

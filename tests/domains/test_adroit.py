@@ -4,6 +4,7 @@ import csv
 import json
 
 import gymnasium as gym
+import minari
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -138,10 +139,21 @@ def test_minaris_demonstrations_are_taken_as_they_are():
     assert dataset[0].rewards[0] == pytest.approx(-0.05 - 0.1 * 1.57**2)
 
 
-def test_minaris_demonstrations_with_the_environments_reward_are_warned_of():
+def test_minaris_demonstrations_with_the_environments_reward_are_converted_with_a_warning():
     install_minari_door(1.0)
-    with pytest.warns(RewardWarning, match=r"the true values of 'adroit-door' count D4RL's"):
-        assert load("adroit-door-human").id == "D4RL/door/human-v2"
+    with pytest.warns(RewardWarning, match=r"the true values of 'adroit-door' count D4RL's.* converted to these"):
+        dataset = load("adroit-door-human")
+    assert dataset.id == "oat_gym/door-human-v0"
+    np.testing.assert_allclose(dataset[0].rewards, -0.05 - 0.1 * 1.57**2)
+    np.testing.assert_allclose(dataset[0].infos["stock_reward"], 0.05 - 0.1 * 1.57**2)
+    np.testing.assert_array_equal(dataset[0].observations, minari.load_dataset("D4RL/door/human-v2")[0].observations)
+
+
+@pytest.mark.parametrize("content", [b"no numbers", b"PK\x03\x04 cut off"])
+def test_a_damaged_file_is_named(content: bytes, tmp_path):
+    (tmp_path / "door.npz").write_bytes(content)
+    with pytest.raises(InvalidDataError, match=r"door\.npz cannot be read as plain arrays.*minari download"):
+        adroit.door_human(tmp_path / "door.npz")
 
 
 @pytest.mark.parametrize("name", sorted(ADROIT))

@@ -186,12 +186,14 @@ def test_demonstrations_with_the_environments_reward_get_d4rls():
         rewards=np.full(30, 0.1 - 0.1 * 1.57**2),
         terminations=np.zeros(30, dtype=bool),
         truncations=np.arange(30) == 29,
+        infos={"success": np.arange(31) / 10},  # as Minari's collector has it: with the reset's row
     )
     box = spaces.Box(-np.inf, np.inf, (39,), np.float64)
     source = install_dataset("test/stock-v0", [buffer], box, spaces.Box(-1, 1, (28,)))
     dataset = cloned_dataset("door", source, level="cloned", steps=70, cloning=_QUICK)
     np.testing.assert_allclose(dataset[0].rewards, -0.1 - 0.1 * 1.57**2)
     np.testing.assert_allclose(dataset[0].infos["stock_reward"], 0.1 - 0.1 * 1.57**2)
+    np.testing.assert_array_equal(dataset[0].infos["success"], np.arange(1, 31) / 10)
 
 
 def test_the_four_levels_are_the_tasks_datasets(door_expert):
