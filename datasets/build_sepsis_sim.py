@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from oat_gym._rng import derive
-from oat_gym.domains import pictures, sepsis_sim
+from oat_gym.domains import pictures, sepsis, sepsis_sim
 from oat_gym.domains._sepsis_clinician import Clinician
 from oat_gym.domains.sepsis_attributes import NAMES
 from oat_gym.domains.sepsis_belief import current_values, last_known
@@ -268,7 +268,7 @@ def describe(tables: Path | None) -> None:
         path=OUT / "stages.png",
     )
     print(side_by_side(real, wide))
-    returns = np.array([sepsis_sim.GAMMA ** np.arange(len(e.rewards)) @ e.rewards for e in data])
+    returns = np.array([sepsis.GAMMA ** np.arange(len(e.rewards)) @ e.rewards for e in data])
     print(f"{len(data)} episodes, {data.total_steps} steps, mean discounted return {returns.mean():.2f}")
 
 
@@ -276,7 +276,7 @@ def train(out: Path) -> None:
     """Train the five networks on other patients of the clinician and write them to `out`."""
     data = sepsis_sim.visits_dataset(sepsis_sim.TRAINING_VISITS, seed=sepsis_sim.TRAINING_SEED)
     out.mkdir(parents=True, exist_ok=True)
-    for name, (settings, seed) in sepsis_sim.NETWORKS.items():
+    for name, (settings, seed) in sepsis.TARGETS.items():
         settings.fit(data, seed=seed).save(out / f"{name}.safetensors")
         print(f"trained {name}: {settings}", flush=True)
 

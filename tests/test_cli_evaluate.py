@@ -131,7 +131,7 @@ def test_estimates_are_kept_where_no_true_value_is_known(
     [
         (["--estimators", "magic"], ConfigurationError, "no estimator 'magic'"),
         (["--use-augmented", "half"], ConfigurationError, "--use-augmented must be one of"),
-        (["--behavior", "guess"], ConfigurationError, "clone or logged"),
+        (["--behavior", "guess"], ConfigurationError, "--behavior must be one of clone, logged"),
         (["--augmenter", "magic"], ConfigurationError, "no augmenter 'magic'"),
         (["--gamma", "1.5", "--policies", "POLICIES"], ConfigurationError, "gamma must be"),
         (["--truth", "BAD"], InvalidDataError, "columns policy and value"),

@@ -29,6 +29,12 @@ def open_source(name: str) -> MinariDataset:
     return domains.load(name) if name in domains.DATASETS else find_source(name)
 
 
+def check_choice(option: str, value: str, choices: tuple[str, ...]) -> None:
+    """Raise `ConfigurationError` unless the value of an option is one of its choices."""
+    if value not in choices:
+        raise ConfigurationError(f"{option} must be one of {', '.join(choices)}, got {value!r}.")
+
+
 def find_augmenter(name: str) -> Augmenter:
     """Return the augmenter of a name with its defaults; `ConfigurationError` for a name that is not there."""
     if name not in AUGMENTERS:

@@ -23,7 +23,7 @@ from oat_gym.benchmark.runner import Listener, Pace, format_seconds, run
 from oat_gym.benchmark.story import best_sentences
 from oat_gym.benchmark.tables import all_tables, write_tables
 from oat_gym.benchmark.variants import VARIANTS, Variant, find_variant, parse_variants
-from oat_gym.cli._shared import out
+from oat_gym.cli._shared import check_choice, out
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError
 
 Folder = Annotated[Path, typer.Option("--out", help="Folder of the results; a run goes on where it was stopped.")]
@@ -89,10 +89,8 @@ def _seeds(suite: Suite, seeds: int | None, seed: int | None) -> list[int]:
 
 
 def _question(initial: str, behavior: str, gamma: float | None) -> Question:
-    if initial not in ("reset", "data"):
-        raise ConfigurationError(f"--initial must be reset or data, got {initial!r}.")
-    if behavior not in ("clone", "logged"):
-        raise ConfigurationError(f"--behavior must be clone or logged, got {behavior!r}.")
+    check_choice("--initial", initial, ("reset", "data"))
+    check_choice("--behavior", behavior, ("clone", "logged"))
     if gamma is not None and not 0 < gamma <= 1:
         raise ConfigurationError(f"--gamma must be above 0 and at most 1, got {gamma}.")
     return Question(

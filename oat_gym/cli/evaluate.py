@@ -16,7 +16,7 @@ from rich.table import Table
 from oat_gym import domains, ope
 from oat_gym.augmenters import AUGMENTERS
 from oat_gym.cache import write_atomically
-from oat_gym.cli._shared import Dataset, Factor, Seed, find_augmenter, open_source, out
+from oat_gym.cli._shared import Dataset, Factor, Seed, check_choice, find_augmenter, open_source, out
 from oat_gym.dataset import AugmentedDataset
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError
 from oat_gym.progress import progress_bar
@@ -56,19 +56,14 @@ def evaluate(
     are known.
     """
     chosen = _estimators(estimators)
-    if use_augmented not in _PARTS:
-        raise ConfigurationError(f"--use-augmented must be one of {', '.join(_PARTS)}, got {use_augmented!r}.")
-    if behavior not in ("clone", "logged"):
-        raise ConfigurationError(f"--behavior must be clone or logged, got {behavior!r}.")
-    if initial not in ("data", "reset"):
-        raise ConfigurationError(f"--initial must be data or reset, got {initial!r}.")
+    check_choice("--use-augmented", use_augmented, tuple(_PARTS))
+    check_choice("--initial", initial, ("data", "reset"))
+    check_choice("--behavior", behavior, ("clone", "logged"))
     given = None if truth is None else read_truth(truth)
     data = _data(dataset, augmenter, factor, seed)
     targets, task = _targets(policies, dataset, data)
-    if gamma is None:
-        gamma = task.gamma if task else 0.995
-    if horizon is None and task:
-        horizon = task.horizon
+    gamma = (task.gamma if task else 0.995) if gamma is None else gamma
+    horizon = task.horizon if horizon is None and task else horizon
     starts = _initial_states(task) if initial == "reset" else None
     known = _known(given, task, list(targets), gamma=gamma, horizon=horizon)
     with progress_bar() as progress:
@@ -81,12 +76,23 @@ def evaluate(
             gamma=gamma,
             horizon=horizon,
             seeds=seeds,
-            behavior=behavior,
+            behavior="logged" if behavior == "logged" else "clone",
             initial_states=starts,
             use_augmented=_PARTS[use_augmented],
             paired=isinstance(data, AugmentedDataset) and use_augmented != "none",
             progress=progress,
         )
+    _print_estimates(result)
+    if file is not None:
+        write_atomically(file, to_csv(result.rows).encode())
+        out.print(f"Every estimate: {file}")
+    if known is not None:
+        if starts is None and task and task.initial_states:
+            out.print("True values count from the environment's resets, estimates from the data's first states.")
+        _print_errors(result, known)
+
+
+def _print_estimates(result: ope.Result) -> None:
     _print_rows(
         result.over_seeds(),
         ("policy", "estimator", "data", "value", "standard_error", "low", "high", "covers_training"),
@@ -94,16 +100,11 @@ def evaluate(
     if result.question.paired:
         out.print("Change by the synthetic episodes:")
         _print_rows(result.differences, ("policy", "estimator", "seed", "difference", "standard_error", "low", "high"))
-    if file is not None:
-        write_atomically(file, to_csv(result.rows).encode())
-        out.print(f"Every estimate: {file}")
-    if known is not None:
-        if initial == "data" and task and task.initial_states:
-            out.print("True values count from the environment's resets, estimates from the data's first states.")
-        _print_rows(
-            result.compare(known),
-            ("estimator", "data", "seed", "mae", "rank_correlation", "regret_at_1", "regret_at_5"),
-        )
+
+
+def _print_errors(result: ope.Result, known: dict[str, float] | domains.Truth) -> None:
+    columns = ("estimator", "data", "seed", "mae", "rank_correlation", "regret_at_1", "regret_at_5")
+    _print_rows(result.compare(known), columns)
 
 
 def _initial_states(task: domains.Task | None) -> Batch:

@@ -9,8 +9,8 @@ PointMaze that frame, goal, start and reward; DOPE's policies then drive it as t
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from minari.data_collector import EpisodeBuffer
 
 from oat_gym._rng import check_seed, derive
 from oat_gym.domains._data import converted, find_file
-from oat_gym.domains.maze2d_env import HORIZON, open_maze
+from oat_gym.domains.maze2d_env import HORIZON, open_mazes
 from oat_gym.domains.maze2d_layout import UMAZE
 from oat_gym.domains.task import Task
 from oat_gym.domains.truth import Truth, read_truth
@@ -142,18 +142,9 @@ def _start(rng: np.random.Generator) -> FloatArray:
     return np.concatenate([position, _SPEED_NOISE * rng.standard_normal(2)])
 
 
-@contextmanager
-def open_d4rl_mazes(count: int) -> Generator[SyncVectorEnv]:
-    """Open `count` environments that are stepped together, and remove the files that they leave.
-
-    Raises:
-        ConfigurationError: for a count below 1.
-    """
-    if count < 1:
-        raise ConfigurationError(f"count must be at least 1, got {count}.")
-    with ExitStack() as stack:
-        mazes = [stack.enter_context(open_maze()) for _ in range(count)]
-        yield SyncVectorEnv([lambda maze=maze: D4RLMaze(maze) for maze in mazes])
+def open_d4rl_mazes(count: int) -> AbstractContextManager[SyncVectorEnv]:
+    """Open `count` environments in D4RL's frame that are stepped together (`open_mazes`)."""
+    return open_mazes(count, wrap=D4RLMaze)
 
 
 def initial_states(count: int, seed: int) -> Batch:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -45,8 +45,10 @@ def open_maze(*, continuing: bool = False) -> Generator[gym.Env[Any, Any]]:
 
 
 @contextmanager
-def open_mazes(count: int) -> Generator[SyncVectorEnv]:
-    """Open `count` goal-terminated environments that are stepped together.
+def open_mazes(
+    count: int, *, wrap: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] = lambda env: env
+) -> Generator[SyncVectorEnv]:
+    """Open `count` goal-terminated environments, each handed to `wrap`, that are stepped together.
 
     Raises:
         ConfigurationError: for a count below 1.
@@ -55,7 +57,7 @@ def open_mazes(count: int) -> Generator[SyncVectorEnv]:
         raise ConfigurationError(f"count must be at least 1, got {count}.")
     with ExitStack() as stack:
         envs = [stack.enter_context(open_maze()) for _ in range(count)]
-        yield SyncVectorEnv([lambda env=env: env for env in envs])
+        yield SyncVectorEnv([lambda env=env: wrap(env) for env in envs])
 
 
 def initial_states(count: int, seed: int) -> Batch:

@@ -23,8 +23,9 @@ from minari.data_collector import EpisodeBuffer
 
 from oat_gym.domains._data import generated
 from oat_gym.domains._sepsis_clinician import Clinician
-from oat_gym.domains.dqn import DQN, QNetwork
+from oat_gym.domains.dqn import QNetwork
 from oat_gym.domains.rollout import Recording, roll_out
+from oat_gym.domains.sepsis import GAMMA, TARGETS
 from oat_gym.domains.task import Task
 from oat_gym.domains.truth import Truth, read_truth
 from oat_gym.embedded import embedded_file
@@ -38,22 +39,12 @@ from oat_gym.ope.policy import Policy
 from oat_gym.spaces import Batch, tree_length
 
 NAME = "sepsis-sim"
-GAMMA = 0.99
 HORIZON = 1160
 """The paper's."""
 VISITS = 150
 TRAINING_VISITS = 600
 TRAINING_SEED = 1_000_000
 """Of the patients that the networks are trained on; the dataset's begin at 0, those of the true values at 2,000,000."""
-
-NETWORKS: dict[str, tuple[DQN, int]] = {
-    "dqn": (DQN(gamma=GAMMA), 0),
-    "dqn-lr-1e-4": (DQN(learning_rate=1e-4, gamma=GAMMA), 0),
-    "dqn-lr-1e-5": (DQN(learning_rate=1e-5, gamma=GAMMA), 0),
-    "dqn-seed-1": (DQN(gamma=GAMMA), 1),
-    "dqn-gamma-0.9": (DQN(gamma=0.9), 0),
-}
-"""Name of each trained target policy, its settings and its seed: the paper's five (appendix D.1)."""
 
 FIXED = {"no-treatment": 0, "antibiotics": 1, "oxygen": 2, "both-treatments": 3}
 """Name and action of the policies that do the same whatever they see, but for 5% random actions."""
@@ -146,13 +137,13 @@ def policies() -> dict[str, Policy]:
     Raises:
         DatasetNotFoundError: if the installation lacks the networks.
     """
-    networks: dict[str, Policy] = {name: network(name).softened() for name in NETWORKS}
+    networks: dict[str, Policy] = {name: network(name).softened() for name in TARGETS}
     plain: dict[str, Policy] = {"clinician": Clinician(), "inattentive": Clinician(attention=0.25)}
     return networks | plain | {name: always(action) for name, action in FIXED.items()}
 
 
 def network(name: str) -> QNetwork:
-    """Return one of the trained networks (`NETWORKS`)."""
+    """Return one of the trained networks (`sepsis.TARGETS`: the paper's settings)."""
     file = embedded_file(f"sepsis-sim/policies/{name}.safetensors")
     return QNetwork.load(file, observation_space=OBSERVATION_SPACE, action_space=ACTION_SPACE)
 

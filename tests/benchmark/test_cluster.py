@@ -7,6 +7,7 @@ import warnings
 from pathlib import Path
 
 import cloudpickle
+import distributed
 import numpy as np
 import pytest
 
@@ -19,13 +20,11 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # of Dask's own, when a worke
 
 
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
     with pytest.raises(ConfigurationError, match="No Dask scheduler answers"):
         run(plan_of("none"), tmp_path, scheduler="tcp://127.0.0.1:1", catalog=tiny.CATALOG)
 
 
 def test_a_cluster_that_loses_a_worker_finishes_with_the_same_cells(tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed")
     plan = plan_of("jittering", seeds=tuple(range(6)))
     cloudpickle.register_pickle_by_value(tiny)
     with warnings.catch_warnings():

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from oat_gym.benchmark import figures, paper
@@ -144,7 +145,6 @@ def test_tidy_rows_keep_every_number(analysis: Analysis, tmp_path: Path) -> None
     assert "NaN" not in to_csv(by_cell) and "nan" not in to_csv(by_cell).split("\n", 1)[1]
     paths = {path.name for path in write_tidy(results, tmp_path)}
     assert {"estimates.csv", "cells.csv", "estimates.parquet", "cells.parquet"} <= paths
-    pq = pytest.importorskip("pyarrow.parquet")
     assert pq.read_table(tmp_path / "estimates.parquet").num_rows == len(rows)
 
 

@@ -10,6 +10,7 @@ from oat_gym.checks import check_dataset
 from oat_gym.domains import _sepsis_clinician, sepsis_sim
 from oat_gym.domains._sepsis_clinician import Clinician
 from oat_gym.domains.rollout import roll_out
+from oat_gym.domains.sepsis import GAMMA
 from oat_gym.domains.sepsis_attributes import NAMES
 from oat_gym.domains.sepsis_stages import PENALTIES
 from oat_gym.domains.truth import discounted_returns
@@ -76,19 +77,19 @@ def test_a_build_is_the_same_bytes_again_and_other_seeds_are_not(tmp_path):
 
 
 def test_the_stored_values_are_those_of_fresh_roll_outs():
-    truth, targets = sepsis_sim.truth(sepsis_sim.GAMMA), sepsis_sim.policies()
+    truth, targets = sepsis_sim.truth(GAMMA), sepsis_sim.policies()
     assert list(truth.values) == list(targets)
     assert truth.episodes >= 1000
     ward = sepsis_sim.open_ward(250)
     for name in ("dqn", "dqn-gamma-0.9", "no-treatment"):
         rewards = roll_out(ward, targets[name], seeds=range(250), horizon=sepsis_sim.HORIZON, policy_seed=9).rewards
-        returns = discounted_returns(rewards, sepsis_sim.GAMMA)
+        returns = discounted_returns(rewards, GAMMA)
         error = np.hypot(returns.std(ddof=1) / 250**0.5, truth.standard_errors[name])
         assert abs(returns.mean() - truth.values[name]) < 4 * error, name
 
 
 def test_policies_are_told_apart_by_their_true_values():
-    truth = sepsis_sim.truth(sepsis_sim.GAMMA)
+    truth = sepsis_sim.truth(GAMMA)
     assert truth.values["both-treatments"] > truth.values["clinician"] > truth.values["no-treatment"]
     spread = max(truth.values.values()) - min(truth.values.values())
     assert spread > 20 * max(truth.standard_errors.values())
