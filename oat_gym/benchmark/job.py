@@ -42,7 +42,7 @@ class JobReport:
     wall_seconds: float
 
 
-def run_job(job: Job, folder: Path, *, device: str = "cpu", catalog: Catalog | None = None) -> JobReport:
+def run_job(job: Job, folder: Path, *, catalog: Catalog | None = None) -> JobReport:
     """Compute the cells of a job that are not finished, and write their files into `folder`.
 
     Everything runs on one thread: sums over several threads differ in their last digits with the number of threads,
@@ -52,7 +52,7 @@ def run_job(job: Job, folder: Path, *, device: str = "cpu", catalog: Catalog | N
     missing = [cell for cell in job.cells() if finished(cell_path(folder, cell)) is None]
     with one_thread(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        desk = _Desk(job, folder, device, tuple(missing), {})
+        desk = _Desk(job, folder, tuple(missing), {})
         if missing:
             try:
                 _evaluate(desk, places)
@@ -81,7 +81,6 @@ class _Desk:
 
     job: Job
     folder: Path
-    device: str
     missing: tuple[Cell, ...]
     reasons: dict[str, str]
 
@@ -131,7 +130,7 @@ def _evaluate(desk: _Desk, places: Catalog) -> None:
     policies = task.policies()
     data, augmentation = _augment(desk, real, name, _curves(places, job, real, policies))
     known = _known(task, job, list(policies), real.total_episodes, name)
-    initial = initial_states(task, job)
+    initial = job.question.starts(task)
     estimators = [
         Measured(cell.estimator[1], _writer(desk, cell, known, augmentation, initial)) for cell in desk.missing
     ]
@@ -140,14 +139,14 @@ def _evaluate(desk: _Desk, places: Catalog) -> None:
         data,
         policies,
         estimators,
-        gamma=known["gamma"],
-        horizon=task.horizon,
+        gamma=job.ground.gamma,
+        horizon=job.ground.horizon,
         seeds=(job.seed,),
         behavior=job.budget.cloning if job.question.behavior == "clone" else "logged",
         initial_states=initial,
         use_augmented=None if use is None else {each.name: _use(use, each) for each in estimators},
         resamples=job.question.resamples,
-        device=desk.device,
+        device=job.device,
         progress=False,
     )
 
@@ -182,7 +181,7 @@ def _augment(
     job, clock = desk.job, Clock()
     data, kept = real, False
     if job.variant.augmenter is not None:
-        augmenter = on_device(job.variant.augmenter, desk.device)
+        augmenter = on_device(job.variant.augmenter, job.device)
         data = AugmentedDataset(real, augmenter, factor=job.variant.factor, seed=job.seed)
         kept = data.is_fitted
         data.fit(progress=False)
@@ -192,13 +191,6 @@ def _augment(
     heads |= {"seed": job.seed, "budget": job.budget.name, "cost": cost, "agreement": agreement}
     write_augmented(desk.folder, job.name, arrays, heads | value)
     return data, cost
-
-
-def initial_states(task: Task, job: Job) -> Batch | None:
-    """Return the states that values count from; None for the data's own."""
-    if job.question.initial == "data" or task.initial_states is None:
-        return None
-    return task.initial_states(job.question.resets, 0)
 
 
 def find_truth(task: Task, gamma: float) -> tuple[Truth | None, str]:
@@ -213,16 +205,15 @@ def find_truth(task: Task, gamma: float) -> tuple[Truth | None, str]:
 
 def _known(task: Task, job: Job, policies: list[str], episodes: int, name: str) -> dict[str, Any]:
     """Return what all cells of a job say of their task: discount, horizon, true values."""
-    gamma = task.gamma if job.question.gamma is None else job.question.gamma
-    truth, why = find_truth(task, gamma)
+    truth, why = find_truth(task, job.ground.gamma)
     values = [math.nan if truth is None else float(truth.values.get(name, math.nan)) for name in policies]
     errors = [math.nan if truth is None else float(truth.standard_errors.get(name, math.nan)) for name in policies]
     return {
         "task": name,
         "paper": task.paper,
         "policies": policies,
-        "gamma": float(gamma),
-        "horizon": task.horizon,
+        "gamma": job.ground.gamma,
+        "horizon": job.ground.horizon,
         "truth": {"values": values, "errors": errors, "episodes": 0 if truth is None else truth.episodes},
         "truth_note": why if truth is None else truth.note,
         "n_episodes": int(episodes),
@@ -275,7 +266,7 @@ def _blank(desk: _Desk, cell: Cell, known: Mapping[str, Any], initial: Batch | N
             "config": cell.config,
             "fingerprint": cell.fingerprint,
             "truth_episodes": truth["episodes"],
-            "environment": environment(desk.device),
+            "environment": environment(job.device),
             "finished": time.time(),
             "diagnostics": [],
         },

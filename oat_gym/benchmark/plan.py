@@ -13,13 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from oat_gym.benchmark.budget import Budget
+from oat_gym.benchmark.ground import Ground, survey
 from oat_gym.benchmark.job import find_truth
 from oat_gym.benchmark.measure import environment
 from oat_gym.benchmark.protocol import Catalog, Job, Question, Suite, make_jobs
 from oat_gym.benchmark.store import cell_path, finished
 from oat_gym.benchmark.variants import Variant
 from oat_gym.cache import canonical, fingerprint, write_atomically
-from oat_gym.errors import ConfigurationError, DatasetNotFoundError
+from oat_gym.domains import Truth
+from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError
 from oat_gym.source import Source
 
 
@@ -32,14 +34,14 @@ class Plan:
         jobs: all jobs, finished ones too.
         missing: dataset -> why it cannot be run here, which says how to get it.
         unknown_truth: dataset -> why its policies' true values are unknown.
-        policies: dataset -> number of target policies.
+        truths: dataset -> true values of its policies, where they are known.
     """
 
     suite: Suite
     jobs: tuple[Job, ...]
     missing: dict[str, str]
     unknown_truth: dict[str, str]
-    policies: dict[str, int]
+    truths: dict[str, Truth]
 
     @property
     def n_cells(self) -> int:
@@ -58,9 +60,10 @@ def make_plan(
     seeds: Sequence[int],
     question: Question,
     budget: Budget,
+    device: str = "cpu",
     catalog: Catalog | None = None,
 ) -> Plan:
-    """Return the plan of a suite; a dataset that is not at hand is named in `missing`, never an error.
+    """Return the plan of a suite; a dataset that is not at hand, or damaged, is named in `missing`, never an error.
 
     Raises:
         ConfigurationError: for no seed or a repeated one.
@@ -68,25 +71,26 @@ def make_plan(
     if not seeds or len(set(seeds)) < len(seeds):
         raise ConfigurationError(f"seeds must be different seeds, at least one, got {list(seeds)!r}.")
     places = catalog or Catalog.installed()
-    content: dict[str, tuple[str, npt.NDArray[np.int64]]] = {}
+    content: dict[str, tuple[Ground, npt.NDArray[np.int64]]] = {}
     missing: dict[str, str] = {}
     unknown: dict[str, str] = {}
-    policies: dict[str, int] = {}
+    truths: dict[str, Truth] = {}
     for name in suite.datasets:
         try:
             task = places.task_of(name)[1]
-            policies[name] = len(task.policies())
             source = Source(places.load(name, episodes=budget.episodes))
-            content[name] = source.fingerprint, source.lengths
-        except (ConfigurationError, DatasetNotFoundError) as error:
+            ground = survey(source, task, question.starts(task), gamma=question.gamma, device=device)
+        except (ConfigurationError, DatasetNotFoundError, InvalidDataError) as error:
             missing[name] = str(error)
-            policies.pop(name, None)
             continue
-        truth, why = find_truth(task, task.gamma if question.gamma is None else question.gamma)
+        content[name] = ground, source.lengths
+        truth, why = find_truth(task, ground.gamma)
         if truth is None:
             unknown[name] = why
-    jobs = make_jobs(content, variants, seeds=seeds, question=question, budget=budget)
-    return Plan(suite, jobs, missing, unknown, policies)
+        else:
+            truths[name] = truth
+    jobs = make_jobs(content, variants, seeds=seeds, question=question, budget=budget, device=device)
+    return Plan(suite, jobs, missing, unknown, truths)
 
 
 def write_manifest(folder: Path, plan: Plan, *, seeds: Sequence[int], device: str, command: str) -> Path:
@@ -109,11 +113,11 @@ def write_manifest(folder: Path, plan: Plan, *, seeds: Sequence[int], device: st
     told |= {
         "about": plan.suite.about,
         "unknown_truth": plan.unknown_truth,
-        "policies": plan.policies,
+        "truths": {name: _truth(truth) for name, truth in plan.truths.items()},
         "jobs_order": list(variants),
         "notes": {name: variant.note for name, variant in variants.items()},
         "budget_line": plan.jobs[0].budget.describe() if plan.jobs else "",
-        "cells": sorted(cell.fingerprint for job in plan.jobs for cell in job.cells()),
+        "cells": {cell.place: cell.fingerprint for job in plan.jobs for cell in job.cells()},
         "environment": environment(device),
         "command": command,
         "started": time.time(),
@@ -122,6 +126,11 @@ def write_manifest(folder: Path, plan: Plan, *, seeds: Sequence[int], device: st
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, (json.dumps(told, indent=1, sort_keys=True) + "\n").encode())
     return path
+
+
+def _truth(truth: Truth) -> dict[str, list[float]]:
+    """Return policy -> [value, standard error]."""
+    return {name: [float(value), float(truth.standard_errors[name])] for name, value in truth.values.items()}
 
 
 def read_manifests(folder: Path) -> list[dict[str, Any]]:

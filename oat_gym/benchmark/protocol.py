@@ -13,13 +13,15 @@ from minari import MinariDataset
 from oat_gym import domains
 from oat_gym._rng import check_seed
 from oat_gym.benchmark.budget import BUDGETS, Budget
+from oat_gym.benchmark.ground import Ground
 from oat_gym.benchmark.variants import ALL, VARIANTS, Variant, fit_length
 from oat_gym.cache import canonical, fingerprint
 from oat_gym.domains import sepsis
 from oat_gym.errors import ConfigurationError
 from oat_gym.ope import AgreementCurve, Estimator, Policy
+from oat_gym.spaces import Batch
 
-FORMAT = 1
+FORMAT = 2
 """Part of every fingerprint: raise it when a change of the benchmark makes older cells incomparable."""
 Initial = Literal["reset", "data"]
 Curves = Callable[[MinariDataset, Mapping[str, Policy]], dict[str, AgreementCurve]]
@@ -52,6 +54,12 @@ class Question:
         if self.resets < 1 or self.resamples < 2:
             raise ConfigurationError(f"resets must be at least 1 and resamples 2, got {self.resets}, {self.resamples}.")
 
+    def starts(self, task: domains.Task) -> Batch | None:
+        """Return the states that a task's values count from; None for the data's own."""
+        if self.initial == "data" or task.initial_states is None:
+            return None
+        return task.initial_states(self.resets, 0)
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -59,7 +67,7 @@ class Cell:
 
     Attributes:
         dataset: its name in `domains.DATASETS`.
-        data: fingerprint of its content.
+        ground: what all cells of the dataset share.
         variant: the way of augmenting.
         estimator: (key of the family, estimator).
         seed: of the augmentation and of the estimator.
@@ -68,7 +76,7 @@ class Cell:
     """
 
     dataset: str
-    data: str
+    ground: Ground
     variant: Variant
     estimator: tuple[str, Estimator]
     seed: int
@@ -83,7 +91,7 @@ class Cell:
             {
                 "format": FORMAT,
                 "dataset": self.dataset,
-                "data": self.data,
+                "ground": self.ground,
                 "episodes": budget.episodes,
                 "variant": self.variant.description(),
                 "estimator": self.estimator[1],
@@ -101,7 +109,12 @@ class Cell:
     @property
     def name(self) -> str:
         """The cell's file, relative to the folder of results and without an ending."""
-        return f"cells/{self.dataset}/{self.variant.name}/{self.estimator[0]}-{self.seed}-{self.fingerprint[:16]}"
+        return f"{self.place}-{self.fingerprint[:16]}"
+
+    @property
+    def place(self) -> str:
+        """The cell's place in the tables: cells of changed settings have the same one."""
+        return f"cells/{self.dataset}/{self.variant.name}/{self.estimator[0]}-{self.seed}"
 
 
 @dataclass(frozen=True)
@@ -109,23 +122,24 @@ class Job:
     """The cells of one dataset, variant and seed: they share one augmented dataset and all that is fitted to it."""
 
     dataset: str
-    data: str
+    ground: Ground
     variant: Variant
     seed: int
     question: Question
     budget: Budget
+    device: str = "cpu"
 
     def cells(self) -> tuple[Cell, ...]:
         """Return a cell for each estimator of the budget."""
         return tuple(
-            Cell(self.dataset, self.data, self.variant, estimator, self.seed, self.question, self.budget)
+            Cell(self.dataset, self.ground, self.variant, estimator, self.seed, self.question, self.budget)
             for estimator in self.budget.estimators
         )
 
     @property
     def name(self) -> str:
         """The file that says what was mined and generated, without an ending."""
-        parts = {"dataset": self.dataset, "data": self.data, "episodes": self.budget.episodes, "seed": self.seed}
+        parts = {"dataset": self.dataset, "data": self.ground.data, "episodes": self.budget.episodes, "seed": self.seed}
         key = fingerprint(format=FORMAT, variant=self.variant.description(), **parts)
         return f"augmented/{self.dataset}/{self.variant.name}-{self.seed}-{key[:16]}"
 
@@ -242,22 +256,25 @@ class Catalog:
 
 
 def make_jobs(
-    data: Mapping[str, tuple[str, npt.NDArray[np.int64]]],
+    data: Mapping[str, tuple[Ground, npt.NDArray[np.int64]]],
     variants: Sequence[Variant],
     *,
     seeds: Sequence[int],
     question: Question,
     budget: Budget,
+    device: str,
 ) -> tuple[Job, ...]:
     """Return the jobs of some datasets, those of one dataset and seed beside each other.
 
-    `data` gives the fingerprint of each dataset and the lengths of its episodes (for `fit_length`).
+    `data` gives the ground of each dataset and the lengths of its episodes (for `fit_length`).
     """
     jobs: list[Job] = []
-    for name, (content, lengths) in data.items():
+    for name, (ground, lengths) in data.items():
         fitted = [_fitted(variant, lengths, budget) for variant in variants]
         jobs += [
-            Job(name, content, variant, check_seed(seed), question, budget) for seed in seeds for variant in fitted
+            Job(name, ground, variant, check_seed(seed), question, budget, device)
+            for seed in seeds
+            for variant in fitted
         ]
     return tuple(jobs)
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import logging
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 from oat_gym.benchmark.plan import read_manifests
 from oat_gym.benchmark.scores import METRICS, score
 from oat_gym.benchmark.store import CellResult, read_augmented, read_cells
+from oat_gym.benchmark.variants import NONE
 from oat_gym.cache import Arrays, write_atomically
 from oat_gym.errors import ConfigurationError
 from oat_gym.ope.intervals import bootstrap_interval, standard_error
@@ -27,17 +29,25 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Setting:
-    """What cells must share to stand in one table: the budget and where values count from."""
+    """What cells must share to stand in one table: the budget and the question (`protocol.Question`)."""
 
     budget: str
     initial: str
     behavior: str
     gamma: float | None
+    resets: int = 200
+    resamples: int = 400
+
+    @classmethod
+    def of(cls, budget: str, question: Mapping[str, Any]) -> Setting:
+        """Return the setting of a budget's name and a question as a manifest or a cell holds it."""
+        return cls(budget, **{name: value for name, value in question.items() if name != "class"})
 
     def describe(self) -> str:
         """Return it in words."""
         where = "the environment's first states" if self.initial == "reset" else "the data's first states"
-        return f"budget {self.budget!r}, values from {where}, behaviour policy {self.behavior!r}"
+        gamma = "" if self.gamma is None else f", gamma {self.gamma}"
+        return f"budget {self.budget!r}, values from {where}, behaviour policy {self.behavior!r}{gamma}"
 
 
 @dataclass(frozen=True)
@@ -46,7 +56,8 @@ class Results:
 
     Attributes:
         setting: what the cells share.
-        cells: one for each dataset, variant, estimator and seed, the newest where there are several.
+        cells: one for each dataset, variant, estimator and seed: the newest, of those that can be compared with the
+            newest one without augmentation. Their true values are those of the last run.
         manifests: of the runs of this setting, the oldest first.
         augmented: (arrays, value) of what was mined and generated.
     """
@@ -85,10 +96,10 @@ class Results:
 
     @property
     def unfinished(self) -> int:
-        """Number of cells that the runs asked for and that are not there, or failed."""
-        asked = {key for manifest in self.manifests for key in manifest["cells"]}
+        """Number of cells that the runs asked for and that are not there, or failed; the last run of a place counts."""
+        asked = {place: key for manifest in self.manifests for place, key in manifest["cells"].items()}
         done = {cell.record["fingerprint"] for cell in self.cells if not cell.failed}
-        return len(asked - done)
+        return len(set(asked.values()) - done)
 
 
 def read_results(folder: Path) -> tuple[Results, ...]:
@@ -104,31 +115,57 @@ def read_results(folder: Path) -> tuple[Results, ...]:
         own = [m for m in manifests if not m["question"] or _manifest_setting(m) == setting]
         members = [cell for cell in cells if _cell_setting(cell) == setting]
         made = [pair for pair in augmented if pair[1]["budget"] == setting.budget]
-        found.append(Results(setting, _newest(members), tuple(own), tuple(made)))
+        found.append(Results(setting, tuple(with_truth(comparable(members), own)), tuple(own), tuple(made)))
     return tuple(found)
 
 
 def _manifest_setting(manifest: dict[str, Any]) -> Setting:
-    question = manifest["question"]
-    return Setting(manifest["budget"]["name"], question["initial"], question["behavior"], question["gamma"])
+    return Setting.of(manifest["budget"]["name"], manifest["question"])
 
 
 def _cell_setting(cell: CellResult) -> Setting:
-    question = cell.record["config"]["question"]
-    return Setting(cell.budget, question["initial"], question["behavior"], question["gamma"])
+    return Setting.of(cell.budget, cell.record["config"]["question"])
 
 
-def _newest(cells: Iterable[CellResult]) -> tuple[CellResult, ...]:
-    """Return the newest cell of each place in the tables; says how many are superseded by other settings."""
-    kept: dict[tuple[str, str, str, int], CellResult] = {}
-    superseded = 0
-    for cell in sorted(cells, key=lambda cell: (float(cell.record["finished"]), cell.record["fingerprint"])):
-        key = (cell.dataset, cell.variant, cell.family, cell.seed)
-        superseded += key in kept
-        kept[key] = cell
-    if superseded:
-        _log.warning("%d older cells of changed settings are left out of the tables.", superseded)
-    return tuple(sorted(kept.values(), key=lambda cell: (cell.dataset, cell.variant, cell.family, cell.seed)))
+def comparable(cells: Iterable[CellResult]) -> list[CellResult]:
+    """Return the newest cell of each place in the tables that shares all but the method with its comparison.
+
+    The comparison is the newest cell without augmentation of the dataset and estimator (where there is none, the
+    newest of any variant): cells of other data, policies, horizons, discounts, versions or settings of the estimator
+    are left out, and so are cells of a variant's earlier settings. A warning counts them.
+    """
+    ordered = sorted(cells, key=lambda cell: (float(cell.record["finished"]), cell.record["fingerprint"]))
+    grounds: dict[tuple[str, str], str] = {}
+    for cell in sorted(ordered, key=lambda cell: cell.variant == NONE):  # stable: the newest plain cell comes last
+        grounds[cell.dataset, cell.family] = _shared(cell)
+    matching = [cell for cell in ordered if _shared(cell) == grounds[cell.dataset, cell.family]]
+    methods = {(cell.dataset, cell.variant): cell.record["config"]["variant"] for cell in matching}
+    kept = {
+        (cell.dataset, cell.variant, cell.family, cell.seed): cell
+        for cell in matching
+        if cell.record["config"]["variant"] == methods[cell.dataset, cell.variant]
+    }
+    if len(kept) < len(ordered):
+        _log.warning("%d cells of older settings or other data are left out of the tables.", len(ordered) - len(kept))
+    return [kept[place] for place in sorted(kept)]
+
+
+def _shared(cell: CellResult) -> str:
+    """Return what two cells must have in common to be compared."""
+    shared = {name: value for name, value in cell.record["config"].items() if name not in ("variant", "seed")}
+    return json.dumps(shared, sort_keys=True)
+
+
+def with_truth(cells: Iterable[CellResult], manifests: Sequence[Mapping[str, Any]]) -> Iterator[CellResult]:
+    """Give the cells with the true values that the last run knew, which may be better than when they were made."""
+    known = {name: truth for manifest in manifests for name, truth in manifest["truths"].items()}
+    for cell in cells:
+        truth = known.get(cell.dataset)
+        if truth is None or not set(cell.policies) <= set(truth):
+            yield cell
+            continue
+        pairs = np.array([truth[name] for name in cell.policies], dtype=np.float64).reshape(-1, 2)
+        yield replace(cell, true=pairs[:, 0], true_errors=pairs[:, 1])
 
 
 def estimate_rows(results: Results) -> list[Row]:

@@ -74,7 +74,6 @@ def run(
     *,
     n_jobs: int = 1,
     scheduler: str | None = None,
-    device: str = "cpu",
     catalog: Catalog | None = None,
     listen: Listener | None = None,
 ) -> list[JobReport]:
@@ -86,7 +85,6 @@ def run(
         n_jobs: processes at a time; -1: one for each core.
         scheduler: address of a Dask scheduler, as "tcp://host:8786": its workers take the jobs, and take over those of
             a worker that is lost. Needs the extra `distributed`.
-        device: torch device.
         catalog: where names of datasets lead; the installed domains by default.
         listen: told of progress.
 
@@ -101,7 +99,7 @@ def run(
     with _backend(n_jobs, scheduler) as (workers, options):
         pace = Pace.of(jobs, min(workers, max(1, len(jobs))))
         tell(pace, None)
-        for report in _results(jobs, folder.resolve(), device, catalog, options):
+        for report in _results(jobs, folder.resolve(), catalog, options):
             _check_written(report, folder)
             pace.add(report)
             tell(pace, report)
@@ -130,13 +128,13 @@ def _backend(n_jobs: int, scheduler: str | None) -> Generator[tuple[int, dict[st
 
 
 def _results(
-    jobs: Sequence[Job], folder: Path, device: str, catalog: Catalog | None, options: dict[str, Any]
+    jobs: Sequence[Job], folder: Path, catalog: Catalog | None, options: dict[str, Any]
 ) -> Iterable[JobReport]:
     if options["n_jobs"] == 1:
-        return (run_job(job, folder, device=device, catalog=catalog) for job in jobs)
+        return (run_job(job, folder, catalog=catalog) for job in jobs)
     # One job a task: batches would tie long jobs together.
     settings: dict[str, Any] = {"return_as": "generator_unordered", "batch_size": 1, **options}
-    calls = (joblib.delayed(run_job)(job, folder, device=device, catalog=catalog) for job in jobs)
+    calls = (joblib.delayed(run_job)(job, folder, catalog=catalog) for job in jobs)
     return cast("Iterable[JobReport]", joblib.Parallel(**settings)(calls))
 
 

@@ -57,14 +57,14 @@ def bench(
     question = _question(initial, behavior, gamma)
     _check_folder(folder)
     _check_device(device)
-    plan = make_plan(chosen, variants, seeds=numbers, question=question, budget=budget)
+    plan = make_plan(chosen, variants, seeds=numbers, question=question, budget=budget, device=device)
     _tell_plan(plan, folder)
     if not plan.jobs:
         raise DatasetNotFoundError(f"No dataset of the suite {suite!r} is on this machine: see above how to get them.")
     command = f"oat-gym {shlex.join(sys.argv[1:])}"
     write_manifest(folder, plan, seeds=numbers, device=device, command=command)
     with _display(plan) as listen:
-        reports = run(plan, folder, n_jobs=jobs, scheduler=scheduler, device=device, listen=listen)
+        reports = run(plan, folder, n_jobs=jobs, scheduler=scheduler, listen=listen)
     _tell_failures(reports)
     for results in read_results(folder):
         _finish(results, folder)

@@ -57,7 +57,7 @@ def results_of(datasets: dict[str, bool], *, seeds: int = 3, extra: tuple[CellRe
     manifest = {
         "question": QUESTION, "budget": {"name": "full"}, "datasets": [*datasets, "adroit-pen-human"],
         "jobs_order": list(ERRORS), "missing": {"adroit-pen-human": "run `minari download D4RL/pen/human-v2`"},
-        "cells": [], "budget_line": "budget 'full'", "command": "oat-gym bench", "started": time.time(),
+        "cells": {}, "budget_line": "budget 'full'", "command": "oat-gym bench", "started": time.time(),
     }  # fmt: skip
     return Results(Setting("full", "reset", "clone", None), (*cells, *extra), (manifest,), ())
 
