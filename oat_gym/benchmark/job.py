@@ -17,6 +17,7 @@ from minari import MinariDataset
 from threadpoolctl import threadpool_limits
 
 from oat_gym import ope
+from oat_gym.augmenters import Augmenter
 from oat_gym.benchmark.augmented import describe_augmented
 from oat_gym.benchmark.measure import Clock, environment
 from oat_gym.benchmark.protocol import Catalog, Cell, Job
@@ -128,7 +129,8 @@ def _evaluate(desk: _Desk, places: Catalog) -> None:
     real = places.load(job.dataset, episodes=job.budget.episodes)
     name, task = places.task_of(job.dataset)
     policies = task.policies()
-    data, augmentation = _augment(desk, real, name, _curves(places, job, real, policies))
+    augmenter = job.variant.with_policies(policies)
+    data, augmentation = _augment(desk, real, augmenter, name, _curves(places, job, real, policies))
     known = _known(task, job, list(policies), real.total_episodes, name)
     initial = job.question.starts(task)
     estimators = [
@@ -175,14 +177,13 @@ def _curves(
 
 
 def _augment(
-    desk: _Desk, real: MinariDataset, task: str, agreement: dict[str, Any] | None
+    desk: _Desk, real: MinariDataset, augmenter: Augmenter | None, task: str, agreement: dict[str, Any] | None
 ) -> tuple[MinariDataset, dict[str, Any]]:
     """Return the dataset of the job and what making it cost; its description is written into the folder."""
     job, clock = desk.job, Clock()
     data, kept = real, False
-    if job.variant.augmenter is not None:
-        augmenter = on_device(job.variant.augmenter, job.device)
-        data = AugmentedDataset(real, augmenter, factor=job.variant.factor, seed=job.seed)
+    if augmenter is not None:
+        data = AugmentedDataset(real, on_device(augmenter, job.device), factor=job.variant.factor, seed=job.seed)
         kept = data.is_fitted
         data.fit(progress=False)
     arrays, value = describe_augmented(data, real, seed=job.seed)

@@ -148,14 +148,14 @@ class Job:
 class Suite:
     """Datasets that are evaluated together.
 
-    `budget` is the name of the budget where `--quick` does not say otherwise, `variants` what `--augmenters all`
+    `budget` is the name of the budget where `--budget` does not say otherwise, `variants` what `--augmenters all`
     means, `seeds` the default number of seeds.
     """
 
     name: str
     datasets: tuple[str, ...]
     about: str
-    budget: str = "full"
+    budget: str = "standard"
     variants: tuple[str, ...] = ALL
     seeds: int = 3
 

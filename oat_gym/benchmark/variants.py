@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from oat_gym.augmenters import AUGMENTERS, OAT, TDA, Augmenter, TimeGAN
+from oat_gym.augmenters import AUGMENTERS, OAT, TDA, Augmenter, Jittering, TimeGAN
+from oat_gym.augmenters.compose import Compose
 from oat_gym.errors import ConfigurationError
 from oat_gym.generation import BehaviorConfig, VAEMDPConfig
 from oat_gym.generation.timegan import TimeGANConfig
 from oat_gym.generation.vae import VAEConfig
 from oat_gym.mining import MiningConfig
-from oat_gym.ope import UseAugmented
+from oat_gym.ope import Policy, UseAugmented
+from oat_gym.ope.policy import PolicySet
+from oat_gym.spaces import Batch, map_tree, tree_length
+
+FloatArray = npt.NDArray[np.float64]
 
 NONE = "none"
 """The variant that augments nothing: what all others are compared with."""
@@ -32,6 +37,7 @@ class Variant:
         use_augmented: what synthetic episodes are used for (`ope.evaluate`): "all" is the paper's way, None uses them
             for training only, so that importance weights and initial states stay real.
         paper: the row of the paper's tables that this one repeats, "" for none.
+        targets: in roll-outs the target policies act (one of them, drawn anew for each step), not the clone.
         note: one line that says what it is.
 
     >>> find_variant("jittering").use_augmented, find_variant("jittering+training").use_augmented
@@ -43,6 +49,7 @@ class Variant:
     factor: float = 10
     use_augmented: UseAugmented = "all"
     paper: str = ""
+    targets: bool = False
     note: str = ""
 
     def __post_init__(self) -> None:
@@ -50,12 +57,40 @@ class Variant:
             raise ConfigurationError(f"Only the variant {NONE!r} has no augmenter, got {self!r}.")
         if self.augmenter is not None and not self.factor > 1:
             raise ConfigurationError(f"factor must be more than 1, got {self.factor!r}.")
+        if self.targets and not isinstance(self.augmenter, OAT):
+            raise ConfigurationError(f"targets is of OAT, which rolls out policies, got {self!r}.")
+
+    def with_policies(self, policies: Mapping[str, Policy]) -> Augmenter | None:
+        """Return the augmenter for a task's target policies."""
+        if not self.targets or not isinstance(self.augmenter, OAT):
+            return self.augmenter
+        return replace(self.augmenter, policy=AnyTarget(PolicySet.of(policies)))
 
     def description(self) -> dict[str, Any]:
         """Return what identifies it: all but the name, the note and the paper's row."""
         if self.augmenter is None:
             return {"augmenter": None}
-        return {"augmenter": self.augmenter, "factor": float(self.factor), "use_augmented": self.use_augmented}
+        described = {"augmenter": self.augmenter, "factor": float(self.factor), "use_augmented": self.use_augmented}
+        return described | ({"targets": True} if self.targets else {})
+
+
+@dataclass(frozen=True)
+class AnyTarget:
+    """One of several policies, drawn anew for each observation."""
+
+    policies: PolicySet
+
+    def sample(self, observations: Batch, *, rng: np.random.Generator) -> Batch:
+        """Return n actions."""
+        drawn = self.policies.sample(observations, rng=rng)
+        n = tree_length(observations)
+        chosen = rng.integers(len(self.policies), size=n)
+        return map_tree(lambda leaf: leaf[chosen, np.arange(n)], drawn)
+
+    def log_prob(self, observations: Batch, actions: Batch) -> FloatArray:
+        """Return the log of the mean density, (n,)."""
+        each = self.policies.log_prob(observations, actions)
+        return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(self.policies)))
 
 
 def _baseline(name: str, paper: str) -> Variant:
@@ -109,6 +144,26 @@ VARIANTS: dict[str, Variant] = {
             use_augmented=None,
             note="20 sets, the recorded actions replayed in the model",
         ),
+        Variant(
+            "oat-targets",
+            OAT(mining=_MANY, start="posterior", seam="matched"),
+            use_augmented=None,
+            targets=True,
+            note="as oat-many, and the target policies act in the model in place of the clone",
+        ),
+        Variant(
+            "oat-light",
+            OAT(start="posterior", seam="matched"),
+            factor=2,
+            use_augmented=None,
+            note="as oat-matched, one synthetic episode for each real one: synthetic steps weigh half",
+        ),
+        Variant(
+            "oat-jitter",
+            Compose((OAT(start="posterior", seam="matched", observation_noise=False), Jittering())),
+            use_augmented=None,
+            note="as oat-smooth, then jittering: regularisation by noise of one size everywhere",
+        ),
     )
 }
 """Every variant by name."""
@@ -149,6 +204,8 @@ def parse_variants(names: str) -> tuple[Variant, ...]:
 
 def quick_augmenter(augmenter: Augmenter) -> Augmenter:
     """Return the same method trained for a moment: at most 60 updates, ten clusters and no search for their number."""
+    if isinstance(augmenter, Compose):
+        return Compose(tuple(quick_augmenter(part) for part in augmenter.augmenters))
     if isinstance(augmenter, TimeGAN):
         small = replace(augmenter.model, embedding_iterations=20, supervised_iterations=10, joint_iterations=10)
         return replace(augmenter, model=small)
@@ -157,6 +214,8 @@ def quick_augmenter(augmenter: Augmenter) -> Augmenter:
 
 def on_device(augmenter: Augmenter, device: str) -> Augmenter:
     """Return the same method with every network on a torch device."""
+    if isinstance(augmenter, Compose):
+        return Compose(tuple(on_device(part, device) for part in augmenter.augmenters))
 
     def moved(part: Any) -> Any:
         if isinstance(part, VAEMDPConfig | VAEConfig | BehaviorConfig | TimeGANConfig):
@@ -172,6 +231,8 @@ def fit_length(augmenter: Augmenter, lengths: npt.NDArray[np.int64]) -> Augmente
     W stays as it is (20 in the paper) where at least half of the episodes have 1.25 W steps; elsewhere it becomes half
     of the median length (at least 2). Other methods are returned as they are.
     """
+    if isinstance(augmenter, Compose):
+        return Compose(tuple(fit_length(part, lengths) for part in augmenter.augmenters))
     median = float(np.median(lengths))
 
     def fitting(width: object) -> int | None:

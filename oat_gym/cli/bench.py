@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from oat_gym.benchmark.analysis import Analysis
-from oat_gym.benchmark.budget import BUDGETS
+from oat_gym.benchmark.budget import BUDGETS, Budget
 from oat_gym.benchmark.job import JobReport
 from oat_gym.benchmark.plan import Plan, make_plan, write_manifest
 from oat_gym.benchmark.protocol import SUITES, Question, Suite, find_suite
@@ -39,7 +39,10 @@ def bench(
     jobs: Annotated[int, typer.Option(help="Processes at a time; -1: one for each core.")] = 1,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, as tcp://host:8786.")] = None,
     device: Annotated[str, typer.Option(help="Torch device: cpu or cuda.")] = "cpu",
-    quick: Annotated[bool, typer.Option(help="A moment's training on few episodes: to see that it works.")] = False,
+    budget: Annotated[str | None, typer.Option(help=f"Training: {', '.join(BUDGETS)}; the suite's own.")] = None,
+    quick: Annotated[
+        bool, typer.Option(help="The same as --budget quick: a moment's training, to try it out.")
+    ] = False,
     initial: Annotated[str, typer.Option(help="Where values count from: reset (the environment) or data.")] = "reset",
     behavior: Annotated[str, typer.Option(help="Behaviour policy: clone, or logged.")] = "clone",
     gamma: Annotated[float | None, typer.Option(help="Discount; the task's own.")] = None,
@@ -53,11 +56,11 @@ def bench(
     chosen = find_suite(suite)
     variants = _variants(chosen, augmenters)
     numbers = _seeds(chosen, seeds, seed)
-    budget = BUDGETS["quick" if quick else chosen.budget].choose(estimators)
+    settings = _budget(chosen, budget, quick=quick).choose(estimators)
     question = _question(initial, behavior, gamma)
     _check_folder(folder)
     _check_device(device)
-    plan = make_plan(chosen, variants, seeds=numbers, question=question, budget=budget, device=device)
+    plan = make_plan(chosen, variants, seeds=numbers, question=question, budget=settings, device=device)
     _tell_plan(plan, folder)
     if not plan.jobs:
         raise DatasetNotFoundError(f"No dataset of the suite {suite!r} is on this machine: see above how to get them.")
@@ -75,6 +78,14 @@ def _variants(suite: Suite, names: str) -> tuple[Variant, ...]:
     if names.strip() == "all":
         return tuple(find_variant(name) for name in suite.variants)
     return parse_variants(names)
+
+
+def _budget(suite: Suite, name: str | None, *, quick: bool) -> Budget:
+    if quick and name not in (None, "quick"):
+        raise ConfigurationError(f"Give --quick or --budget {name}, not both.")
+    if name is not None:
+        check_choice("--budget", name, tuple(BUDGETS))
+    return BUDGETS["quick" if quick else name or suite.budget]
 
 
 def _seeds(suite: Suite, seeds: int | None, seed: int | None) -> list[int]:

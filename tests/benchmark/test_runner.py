@@ -239,3 +239,22 @@ def test_variants_keep_their_form_on_other_devices_and_budgets() -> None:
     assert short.mining.length == 6
     assert fit_length(oat, np.array([200, 300])) is oat
     assert fit_length(VARIANTS["tda"].augmenter, np.array([12])).length == 6
+    both = VARIANTS["oat-jitter"].augmenter
+    assert fit_length(both, np.array([12])).augmenters[0].mining.length == 6
+    assert quick_augmenter(both).augmenters[0].model.max_updates == 60
+
+
+def test_target_policies_act_in_roll_outs_where_a_variant_says_so(tmp_path: Path) -> None:
+    variant = find_variant("oat-targets")
+    assert VARIANTS["oat"].with_policies(tiny.policies()) is VARIANTS["oat"].augmenter
+    proposals = variant.with_policies(tiny.policies()).policy
+    states = np.zeros((4000, 2))
+    actions = proposals.sample(states, rng=np.random.default_rng(0))
+    # at x = 0 a policy of gain g takes g, plus noise of 0.4: the mixture's mean is the mean gain
+    assert actions.mean() == pytest.approx(np.mean(list(tiny.GAINS.values())), abs=0.03)
+    each = [np.exp(policy.log_prob(states[:3], actions[:3])) for policy in tiny.policies().values()]
+    np.testing.assert_allclose(np.exp(proposals.log_prob(states[:3], actions[:3])), np.mean(each, axis=0))
+    plan = plan_of("oat-targets")
+    assert all(not reason for report in run(plan, tmp_path, catalog=tiny.CATALOG) for _, reason in report.cells)
+    with pytest.raises(ConfigurationError, match="rolls out policies"):
+        dataclasses.replace(VARIANTS["jittering"], targets=True)
