@@ -3,8 +3,9 @@
     python datasets/truth_adroit.py --tasks pen door hammer relocate --episodes 200
 
 Every policy takes its mean action and meets the same resets (seeds 0, 1, ...). Rewards are D4RL's. The rewards of each
-policy are kept in --work as soon as they are there, so that an interrupted run goes on where it stopped and a larger
---episodes adds to what exists. It needs the policies' weight files (OAT_GYM_DATA).
+policy are kept in --work as soon as they are there, under the versions of the libraries and what the policy does: an
+interrupted run goes on where it stopped, and a larger --episodes adds to what exists. It needs the policies' weight
+files (OAT_GYM_DATA).
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from oat_gym.cache import fingerprint
 from oat_gym.domains.adroit_env import make_vec_env
 from oat_gym.domains.adroit_policies import dope_policies
 from oat_gym.domains.adroit_rewards import ADROIT
 from oat_gym.domains.rollout import roll_out
-from oat_gym.domains.truth import stored_truth, write_truth
-from oat_gym.ope.policy import Policy
+from oat_gym.domains.truth import installed_versions, stored_truth, write_truth
+from oat_gym.ope import MLPPolicy
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -40,9 +42,9 @@ REWARD = (
 )
 
 
-def rewards_of(name: str, policy: Policy, *, task: str, episodes: int, num_envs: int, work: Path) -> FloatArray:
+def rewards_of(name: str, policy: MLPPolicy, *, task: str, episodes: int, num_envs: int, work: Path) -> FloatArray:
     """Return rewards (episodes, horizon) of a policy, those already in `work` read and the others rolled out."""
-    path = work / f"{name}.npy"
+    path = work / f"{name}-{_key(policy)}.npy"
     have = np.load(path, allow_pickle=False) if path.exists() else np.empty((0, ADROIT[task].horizon))
     if len(have) < episodes:
         start, cpu = len(have), time.process_time()
@@ -55,6 +57,13 @@ def rewards_of(name: str, policy: Policy, *, task: str, episodes: int, num_envs:
         partial.replace(path)
         print(f"{name}: episodes {start} to {episodes - 1}, {time.process_time() - cpu:.0f} CPU s", flush=True)
     return have[:episodes]
+
+
+def _key(policy: MLPPolicy) -> str:
+    """Return what tells rewards of other library versions or of other weights apart."""
+    observation = np.linspace(-1.0, 1.0, policy.n_observations)[None]
+    action = [round(float(number), 5) for number in np.asarray(policy.mean(observation))[0]]
+    return fingerprint(versions=installed_versions(), action=action)[:12]
 
 
 def make_truth(task: str, *, episodes: int, num_envs: int, work: Path, out: Path) -> None:

@@ -24,6 +24,7 @@ from oat_gym.domains.truth import stored_truth, write_truth
 
 FloatArray = npt.NDArray[np.float64]
 
+NUM_ENVS = 25
 COMMAND = "python datasets/truth_maze2d.py --task {task} --episodes {episodes}"
 TASKS = {
     "maze2d-umaze": (
@@ -53,6 +54,7 @@ def make_truth(task: str, *, episodes: int, num_envs: int, jobs: int, out: Path)
     work = (delayed(rewards_of)(task, name, episodes=episodes, num_envs=num_envs) for name in names)
     rewards = dict(zip(names, Parallel(n_jobs=jobs)(work), strict=True))
     command = COMMAND.format(task=task, episodes=episodes)
+    command += "" if num_envs == NUM_ENVS else f" --num-envs {num_envs}"
     write_truth(out / f"{task}.json", stored_truth(rewards, horizon=HORIZON, command=command, note=TASKS[task][1]))
     print(f"wrote {out / f'{task}.json'}")
 
@@ -62,7 +64,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=tuple(TASKS), default="maze2d-umaze")
     parser.add_argument("--episodes", type=int, default=1000)
-    parser.add_argument("--num-envs", type=int, default=25)
+    parser.add_argument("--num-envs", type=int, default=NUM_ENVS)
     parser.add_argument("--jobs", type=int, default=1, help="processes; the result does not depend on it")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "truth")
     options = parser.parse_args()

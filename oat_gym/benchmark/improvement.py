@@ -29,6 +29,9 @@ crossed, and what they do together is counted in both terms: the interval is sli
 that reason (Owen, 2007, "The pigeonhole bootstrap"). Tasks are independent: variances add, divided by their number
 squared. `tests/benchmark/test_improvement.py` has the coverage.
 
+The sum of the terms is cautious: where a method changes nothing, less than 1% of the 95% intervals exclude zero in that
+file's experiments and not 5%, so that "no evidence" is also said of some changes that are there.
+
 The episodes' term holds fixed what an estimator trained (see `ope.Result`), so that with one seed the error of training
 on another sample is not in the interval: then, whatever the numbers, the verdict is "no evidence".
 """

@@ -25,6 +25,7 @@ from oat_gym.benchmark.store import CellResult, cell_path, finished, write_augme
 from oat_gym.benchmark.variants import on_device
 from oat_gym.dataset import AugmentedDataset
 from oat_gym.domains import Task, Truth
+from oat_gym.domains.adroit_rewards import RewardWarning
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError, EstimationWarning, OatGymError
 from oat_gym.ope.problem import Problem
 from oat_gym.spaces import Batch, tree_length
@@ -126,12 +127,13 @@ def _nothing(problem: Problem) -> ope.Estimates:
 
 def _evaluate(desk: _Desk, places: Catalog) -> None:
     job = desk.job
-    real = places.load(job.dataset, episodes=job.budget.episodes)
+    real, doubts = _load(places, job)
     name, task = places.task_of(job.dataset)
     policies = task.policies()
     augmenter = job.variant.with_policies(policies)
     data, augmentation = _augment(desk, real, augmenter, name, _curves(places, job, real, policies))
     known = _known(task, job, list(policies), real.total_episodes, name)
+    known["truth_note"] = " ".join(text for text in (known["truth_note"], *doubts) if text)
     initial = job.question.starts(task)
     estimators = [
         Measured(cell.estimator[1], _writer(desk, cell, known, augmentation, initial)) for cell in desk.missing
@@ -151,6 +153,14 @@ def _evaluate(desk: _Desk, places: Catalog) -> None:
         device=job.device,
         progress=False,
     )
+
+
+def _load(places: Catalog, job: Job) -> tuple[MinariDataset, list[str]]:
+    """Return a job's dataset and what was said of its rewards when it was opened."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        real = places.load(job.dataset, episodes=job.budget.episodes)
+    return real, [str(warning.message) for warning in caught if issubclass(warning.category, RewardWarning)]
 
 
 def _use(use: Any, estimator: Measured) -> Any:

@@ -14,7 +14,7 @@ from oat_gym.benchmark.analysis import MEAN, Analysis
 from oat_gym.benchmark.results import Results, read_results
 from oat_gym.benchmark.runner import now
 from oat_gym.benchmark.scores import METRICS
-from oat_gym.benchmark.tables import adroit_dataset, all_tables, dataset_table, format_number
+from oat_gym.benchmark.tables import adroit_dataset, all_tables, dataset_table, format_number, stand_ins_of
 from oat_gym.benchmark.variants import NONE
 from oat_gym.cache import Arrays, write_atomically
 
@@ -74,7 +74,10 @@ def _groups(analysis: Analysis) -> list[tuple[story.Group, str | None]]:
     for level in paper.LEVELS:
         names = [name for task in paper.TASKS if (name := adroit_dataset(analysis, level, task))]
         if names:
-            groups.append(((f"Adroit {level}: {len(names)} of 4 tasks", names), level))
+            others = stand_ins_of(names)
+            title = f"Adroit {level}: {len(names)} of 4 tasks"
+            title += f" ({len(others)} stand-ins: {', '.join(others)})" if others else ""
+            groups.append(((title, names), level))
     adroit = {name for (_, names), _ in groups for name in names}
     groups += [((name, [name]), None) for name in analysis.with_truth() if name not in adroit]
     return groups

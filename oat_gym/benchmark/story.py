@@ -16,7 +16,7 @@ from oat_gym.benchmark.analysis import MEAN, Analysis, Finding
 from oat_gym.benchmark.figures import Panel
 from oat_gym.benchmark.improvement import Improvement
 from oat_gym.benchmark.scores import METRICS, Metric
-from oat_gym.benchmark.tables import adroit_dataset, format_number
+from oat_gym.benchmark.tables import adroit_dataset, format_number, stand_ins_of
 from oat_gym.benchmark.variants import NONE, VARIANTS
 from oat_gym.cache import Arrays
 from oat_gym.domains import maze2d
@@ -160,7 +160,14 @@ def by_level(analysis: Analysis) -> Picture | None:
             if variant != NONE
         }
     title = "By level of human involvement (human: all by people; expert: none)"
-    return Picture.of(figures.improvement_by_level(panels, levels=list(groups), title=title), title)
+    levels = [_level_label(level, names) for level, names in groups.items()]
+    return Picture.of(figures.improvement_by_level(panels, levels=levels, title=title), title)
+
+
+def _level_label(level: str, names: Sequence[str]) -> str:
+    """Return a level with its number of tasks, and how many of them stand in for the paper's data."""
+    others = stand_ins_of(names)
+    return f"{level}: {len(names)} of 4 tasks" + (f", {len(others)} of them stand-ins" if others else "")
 
 
 def _change(found: Finding | None) -> Improvement | None:

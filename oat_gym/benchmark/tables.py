@@ -263,8 +263,13 @@ def _notes(analysis: Analysis, datasets: dict[str, str | None]) -> str:
     lines = {manifest["budget_line"] for manifest in analysis.results.manifests if manifest["budget_line"]}
     text = f"{len(seeds)} seeds, mean ± standard deviation; {analysis.results.setting.describe()}; "
     text += "; ".join(sorted(lines)) + ". + or - : better or worse than no augmentation, 95% interval excludes zero."
-    stand_ins = [name for name in there if name.endswith("-from-expert")]
+    stand_ins = stand_ins_of(there)
     return text + (f" Stand-ins, not the paper's data: {', '.join(stand_ins)}." if stand_ins else "")
+
+
+def stand_ins_of(datasets: Sequence[str]) -> list[str]:
+    """Return the datasets that stand in for the paper's: cloned from an expert's roll-outs, not from people's."""
+    return [name for name in datasets if name.endswith("-from-expert")]
 
 
 def format_number(value: float) -> str:
