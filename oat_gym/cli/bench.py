@@ -6,6 +6,7 @@ import contextlib
 import shlex
 import sys
 from collections.abc import Generator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -32,6 +33,7 @@ Folder = Annotated[Path, typer.Option("--out", help="Folder of the results; a ru
 def bench(
     suite: Annotated[str, typer.Option(help=f"One of {', '.join(SUITES)}.")] = "quick",
     augmenters: Annotated[str, typer.Option(help=f"all, or some of {', '.join(VARIANTS)}.")] = "all",
+    datasets: Annotated[str, typer.Option(help="all of the suite, or some of them.")] = "all",
     estimators: Annotated[str, typer.Option(help="all, or some of fqe,is,dice,dr,mb.")] = "all",
     seeds: Annotated[int | None, typer.Option(help="How many seeds (0, 1, ...); the suite's own number.")] = None,
     seed: Annotated[int | None, typer.Option(help="This seed alone, to share seeds out over machines.")] = None,
@@ -53,7 +55,7 @@ def bench(
     cells are files of the folder: run the same command again after an interruption and it goes on. Tables and CSV
     files are written at the end; `oat-gym report FOLDER` makes a page of them.
     """
-    chosen = find_suite(suite)
+    chosen = _narrow(find_suite(suite), datasets)
     variants = _variants(chosen, augmenters)
     numbers = _seeds(chosen, seeds, seed)
     settings = _budget(chosen, budget, quick=quick).choose(estimators)
@@ -72,6 +74,19 @@ def bench(
     for results in read_results(folder):
         _finish(results, folder)
     out.print(f"A page to read: oat-gym report {folder}")
+
+
+def _narrow(suite: Suite, names: str) -> Suite:
+    """Return the suite with some of its datasets."""
+    if names.strip() == "all":
+        return suite
+    wanted = tuple(dict.fromkeys(name.strip() for name in names.split(",")))
+    unknown = [name for name in wanted if name not in suite.datasets]
+    if unknown:
+        raise ConfigurationError(
+            f"The suite {suite.name!r} has no dataset {', '.join(unknown)}; it has {', '.join(suite.datasets)}."
+        )
+    return replace(suite, datasets=wanted)
 
 
 def _variants(suite: Suite, names: str) -> tuple[Variant, ...]:
