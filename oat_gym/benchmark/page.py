@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,25 +23,44 @@ from oat_gym.cache import Arrays, write_atomically
 TEMPLATE = "page.html.jinja"
 
 
-def write_page(folder: Path, path: Path) -> Path:
-    """Write the report of a folder of results to `path`; return the path.
+def write_page(folder: Path, path: Path, *, pictures: Path | None = None) -> Path:
+    """Write the report of a folder of results to `path`, and its pictures as PNG files into a folder; return the path.
 
     Raises:
         ConfigurationError: where nothing was run in the folder.
         OSError: if the disk refuses.
     """
+    settings = [_setting(each) for each in read_results(folder)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, make_page(read_results(folder)).encode())
+    write_atomically(path, _render(settings).encode())
+    if pictures is not None:
+        pictures.mkdir(parents=True, exist_ok=True)
+        for number, picture in enumerate(_pictures(settings)):
+            name = re.sub(r"[^a-z0-9]+", "-", picture.alt.lower())[:60].strip("-")
+            write_atomically(pictures / f"{number:02d}-{name}.png", base64.b64decode(picture.data))
     return path
 
 
 def make_page(results: tuple[Results, ...]) -> str:
     """Return the page of one or more settings as HTML."""
+    return _render([_setting(each) for each in results])
+
+
+def _pictures(part: Any) -> Iterator[story.Picture]:
+    """Give the pictures of the page in the order of its parts."""
+    if isinstance(part, story.Picture):
+        yield part
+    elif isinstance(part, dict | list | tuple):
+        for each in part.values() if isinstance(part, dict) else part:
+            yield from _pictures(each)
+
+
+def _render(settings: list[dict[str, Any]]) -> str:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
     )
     template = environment.get_template(TEMPLATE)
-    return template.render(made=now(), settings=[_setting(each) for each in results], metrics=METRICS)
+    return template.render(made=now(), settings=settings, metrics=METRICS)
 
 
 def _setting(results: Results) -> dict[str, Any]:

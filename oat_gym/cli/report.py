@@ -15,6 +15,9 @@ from oat_gym.errors import ConfigurationError
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder that `oat-gym bench --out` wrote.")],
     file: Annotated[Path | None, typer.Option("--out", help="The page; FOLDER/report.html without it.")] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Write its pictures into this folder too, as PNG files.")
+    ] = None,
 ) -> None:
     """Make a page for readers who know the domain: what was mined, what was generated, did it help, how sure are we.
 
@@ -22,5 +25,5 @@ def report(
     """
     if not folder.is_dir():
         raise ConfigurationError(f"{str(folder)!r} is no folder of results: run `oat-gym bench --out {folder}` first.")
-    page = write_page(folder, file or folder / "report.html")
+    page = write_page(folder, file or folder / "report.html", pictures=pictures)
     out.print(f"Report: {page}")

@@ -17,7 +17,7 @@ def tiny_suite(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(domains, "DATASETS", {**domains.DATASETS, **tiny.CATALOG.datasets})
     monkeypatch.setattr(domains, "TASKS", {**domains.TASKS, **tiny.CATALOG.tasks})
     monkeypatch.setitem(protocol.SUITES, "line", tiny.SUITE)
-    monkeypatch.setitem(budget.BUDGETS, "full", tiny.BUDGET)
+    monkeypatch.setitem(budget.BUDGETS, "standard", tiny.BUDGET)
 
 
 @pytest.mark.usefixtures("tiny_suite")
@@ -33,11 +33,15 @@ def test_a_suite_runs_resumes_and_becomes_a_page(tmp_path: Path) -> None:
     assert "4 of them finished" in again.output
     assert list(tmp_path.glob("tables/*/tables.md"))
     assert list(tmp_path.glob("tables/*/cells.csv"))
-    made = CliRunner().invoke(cli.app, ["report", str(tmp_path), "--out", str(tmp_path / "page.html")])
+    page_file, pictures = str(tmp_path / "page.html"), tmp_path / "pictures"
+    made = CliRunner().invoke(cli.app, ["report", str(tmp_path), "--out", page_file, "--pictures", str(pictures)])
     assert made.exit_code == 0
     page = (tmp_path / "page.html").read_text()
     assert "minari download D4RL/line/human-v2" in page
     assert "What was generated" in page
+    written = sorted(pictures.glob("*.png"))
+    assert len(written) == page.count("data:image/png") > 3
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
 
 
 @pytest.mark.parametrize(
@@ -51,6 +55,9 @@ def test_a_suite_runs_resumes_and_becomes_a_page(tmp_path: Path) -> None:
         (["--initial", "somewhere"], "--initial must be"),
         (["--behavior", "magic"], "--behavior must be"),
         (["--gamma", "2"], "--gamma must be"),
+        (["--budget", "magic"], "--budget must be"),
+        (["--quick", "--budget", "full"], "not both"),
+        (["--datasets", "maze2d-umaze,magic"], "no dataset magic; it has maze2d-umaze"),
         (["--device", "magic"], "--device 'magic'"),
     ],
 )
@@ -58,6 +65,15 @@ def test_bad_input_is_named(arguments: list[str], message: str, tmp_path: Path) 
     result = CliRunner().invoke(cli.app, ["bench", *arguments, "--out", str(tmp_path)])
     assert isinstance(result.exception, ConfigurationError)
     assert message in str(result.exception)
+
+
+@pytest.mark.usefixtures("tiny_suite")
+def test_some_datasets_of_a_suite(tmp_path: Path) -> None:
+    arguments = ["bench", "--suite", "line", "--datasets", "line", "--augmenters", "none", "--seeds", "1"]
+    done = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path)], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert "line-human" not in done.output
+    assert "2 cells in 1 jobs" in done.output
 
 
 def test_nothing_at_hand_and_nothing_to_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
