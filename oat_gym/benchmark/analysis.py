@@ -21,12 +21,12 @@ MEAN = "mean"
 
 @dataclass(frozen=True)
 class Finding:
-    """The improvement of one dataset by one variant, for one family of estimators or "mean", by one metric.
+    """The improvement of some datasets by one variant, for one family of estimators or "mean", by one metric.
 
     `families` are those that it is of: a mean leaves out families that failed on either side.
     """
 
-    dataset: str
+    datasets: tuple[str, ...]
     variant: str
     family: str
     metric: Metric
@@ -56,9 +56,10 @@ class Analysis:
         known = {cell.dataset for cell in self.results.cells if not cell.failed and cell.knows_truth}
         return tuple(name for name in self.results.datasets if name in known)
 
-    def without_truth(self) -> tuple[str, ...]:
-        """Return the datasets of which only estimates can be given."""
-        return tuple(name for name in self.results.datasets if name not in self.with_truth())
+    def failed(self) -> tuple[str, ...]:
+        """Return the datasets of which no cell was finished."""
+        done = {cell.dataset for cell in self.results.cells if not cell.failed}
+        return tuple(name for name in self.results.datasets if name not in done)
 
     def cells(self, dataset: str, variant: str, family: str) -> tuple[CellResult, ...]:
         """Return the finished cells of one place in the tables, by seed."""
@@ -84,7 +85,7 @@ class Analysis:
         cell = self.cells(dataset, NONE, both[0])[0]
         n_policies, n_episodes = len(cell.policies), int(cell.record["n_episodes"])
         improvement = improve(before, after, metric, n_policies=n_policies, n_episodes=n_episodes)
-        return Finding(dataset, variant, family, metric, improvement, tuple(both))
+        return Finding((dataset,), variant, family, metric, improvement, tuple(both))
 
     def over(self, datasets: Sequence[str], variant: str, family: str, metric: Metric) -> Finding | None:
         """Return the mean improvement over several datasets; None where none was measured."""
@@ -93,7 +94,8 @@ class Analysis:
             return None
         mean = over_tasks([each.improvement for each in found])
         families = tuple(dict.fromkeys(name for each in found for name in each.families))
-        return Finding(", ".join(each.dataset for each in found), variant, family, metric, mean, families)
+        names = tuple(name for each in found for name in each.datasets)
+        return Finding(names, variant, family, metric, mean, families)
 
     def all_findings(self) -> Iterable[Finding]:
         """Give the improvements of every dataset with known truth, variant, family and "mean", and metric."""

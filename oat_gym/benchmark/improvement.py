@@ -92,7 +92,7 @@ class Improvement:
         standard_error: root of the total variance.
         degrees: Satterthwaite's degrees of freedom.
         parts: the variance by where it comes from.
-        n_seeds: number of seeds that both sides have.
+        n_seeds: number of seeds in which both sides are known, for the estimator that has the fewest.
         before: the metric without augmentation.
         after: the metric with it.
     """
@@ -147,11 +147,11 @@ def improve(
     shapes = [each.points.shape for each in (*before, *after)]
     if not before or len(before) != len(after) or len(set(shapes)) > 1:
         raise InvalidDataError(f"Both sides need the same estimators and seeds, at least one, got shapes {shapes}.")
-    n_seeds = shapes[0][0]
     points = _stack(before, after, "points")
     known = np.asarray(np.isfinite(points).all(axis=0))  # (E, S)
-    if not known.any(axis=1).all():
-        return _nothing(metric, n_seeds)
+    n_seeds = int(known.sum(axis=1).min())
+    if not n_seeds:
+        return _nothing(metric, 0)
     sides = _means(points[..., None, :], known)[:, 0]
     resampled = {name: _means(_stack(before, after, name), known) for name in ("policies", "episodes", "truth")}
     changes = {name: _change(draws[0], draws[1], metric) for name, draws in resampled.items()}
@@ -248,10 +248,7 @@ def _seed_draws(points: FloatArray, known: npt.NDArray[np.bool_], metric: Metric
         return np.zeros(1)
     picks = derive(0, "seeds", n_seeds).integers(0, n_seeds, size=(DRAWS, n_seeds))
     drawn = np.where(known, points, math.nan)[..., picks]  # (2, E, R, S)
-    usable = np.isfinite(drawn).all(axis=0)
-    count = usable.sum(axis=-1)
-    means = np.where(count > 0, np.where(usable, drawn, 0.0).sum(axis=-1) / np.maximum(count, 1), math.nan)
-    sides = means.mean(axis=1)
+    sides = _means(drawn, np.ones_like(known))
     return _change(sides[0], sides[1], metric)
 
 

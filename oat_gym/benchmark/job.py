@@ -28,7 +28,6 @@ from oat_gym.domains import Task, Truth
 from oat_gym.domains.adroit_rewards import RewardWarning
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError, EstimationWarning, OatGymError
 from oat_gym.ope.problem import Problem
-from oat_gym.spaces import Batch, tree_length
 
 FAILURES: tuple[type[Exception], ...] = (OatGymError, ArithmeticError, MemoryError, RuntimeError, ValueError)
 """What one cell may fail with while the others go on; anything else is a bug and ends the run."""
@@ -134,11 +133,7 @@ def _evaluate(desk: _Desk, places: Catalog) -> None:
     data, augmentation = _augment(desk, real, augmenter, name, _curves(places, job, real, policies))
     known = _known(task, job, list(policies), real.total_episodes, name)
     known["truth_note"] = " ".join(text for text in (known["truth_note"], *doubts) if text)
-    initial = job.question.starts(task)
-    estimators = [
-        Measured(cell.estimator[1], _writer(desk, cell, known, augmentation, initial)) for cell in desk.missing
-    ]
-    use = job.variant.use_augmented
+    estimators = [Measured(cell.estimator[1], _writer(desk, cell, known, augmentation)) for cell in desk.missing]
     ope.evaluate(
         data,
         policies,
@@ -147,8 +142,8 @@ def _evaluate(desk: _Desk, places: Catalog) -> None:
         horizon=job.ground.horizon,
         seeds=(job.seed,),
         behavior=job.budget.cloning if job.question.behavior == "clone" else "logged",
-        initial_states=initial,
-        use_augmented=None if use is None else {each.name: _use(use, each) for each in estimators},
+        initial_states=job.question.starts(task),
+        use_augmented=job.variant.use_augmented,
         resamples=job.question.resamples,
         device=job.device,
         progress=False,
@@ -161,14 +156,6 @@ def _load(places: Catalog, job: Job) -> tuple[MinariDataset, list[str]]:
         warnings.simplefilter("always")
         real = places.load(job.dataset, episodes=job.budget.episodes)
     return real, [str(warning.message) for warning in caught if issubclass(warning.category, RewardWarning)]
-
-
-def _use(use: Any, estimator: Measured) -> Any:
-    """Return what one estimator uses: a mapping names families, which the measured estimator hides."""
-    if not isinstance(use, Mapping):
-        return use
-    named: Mapping[str, Any] = use
-    return named.get(estimator.name, named.get(estimator.inner.family, ("training",)))
 
 
 def _curves(
@@ -232,13 +219,16 @@ def _known(task: Task, job: Job, policies: list[str], episodes: int, name: str) 
 
 
 def _writer(
-    desk: _Desk, cell: Cell, known: Mapping[str, Any], augmentation: Mapping[str, Any], initial: Batch | None
+    desk: _Desk, cell: Cell, known: Mapping[str, Any], augmentation: Mapping[str, Any]
 ) -> Callable[[ope.Estimates | str, Mapping[str, Any]], None]:
     """Return what writes a cell's file when its estimator is done."""
 
     def write(found: ope.Estimates | str, extra: Mapping[str, Any]) -> None:
-        blank = _blank(desk, cell, known, initial)
+        blank = _blank(desk, cell, known)
         record = dict(blank.record) | dict(extra) | {"augmentation_cost": dict(augmentation)}
+        if not isinstance(found, str) and not np.isfinite(found.values).all():
+            bad = [name for name, value in zip(blank.policies, found.values, strict=True) if not np.isfinite(value)]
+            found = f"the estimates of {', '.join(bad)} are not finite"
         if isinstance(found, str):
             result = replace(blank, reason=found, record=record)
         else:
@@ -251,11 +241,11 @@ def _writer(
     return write
 
 
-def _blank(desk: _Desk, cell: Cell, known: Mapping[str, Any], initial: Batch | None) -> CellResult:
+def _blank(desk: _Desk, cell: Cell, known: Mapping[str, Any]) -> CellResult:
     """Return a cell without estimates."""
     truth, job = known["truth"], desk.job
     shape = (len(known["policies"]), job.question.resamples)
-    start = "data" if initial is None else f"reset ({tree_length(initial)} states)"
+    start = "data" if job.ground.starts == "data" else f"reset ({job.question.resets} states)"
     heads = {name: known[name] for name in ("paper", "gamma", "horizon", "truth_note", "n_episodes")}
     return CellResult(
         dataset=cell.dataset,
@@ -291,4 +281,4 @@ def _fail_rest(desk: _Desk, places: Catalog, reason: str) -> None:
     for cell in desk.missing:
         if cell.fingerprint not in desk.reasons:
             desk.reasons[cell.fingerprint] = reason
-            write_result(cell_path(desk.folder, cell), replace(_blank(desk, cell, known, None), reason=reason))
+            write_result(cell_path(desk.folder, cell), replace(_blank(desk, cell, known), reason=reason))

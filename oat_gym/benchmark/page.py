@@ -5,19 +5,18 @@ from __future__ import annotations
 import base64
 import math
 import re
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
-from oat_gym.benchmark import paper, story
+from oat_gym.benchmark import story
 from oat_gym.benchmark.analysis import MEAN, Analysis
 from oat_gym.benchmark.results import Results, read_results
-from oat_gym.benchmark.runner import now
 from oat_gym.benchmark.scores import METRICS
-from oat_gym.benchmark.tables import adroit_dataset, all_tables, dataset_table, format_number, stand_ins_of
-from oat_gym.benchmark.variants import NONE
+from oat_gym.benchmark.tables import all_tables, budget_lines, dataset_table, format_number
 from oat_gym.cache import Arrays, write_atomically
 
 TEMPLATE = "page.html.jinja"
@@ -60,18 +59,21 @@ def _render(settings: list[dict[str, Any]]) -> str:
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
     )
     template = environment.get_template(TEMPLATE)
-    return template.render(made=now(), settings=settings, metrics=METRICS)
+    made = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
+    return template.render(made=made, settings=settings, metrics=METRICS)
 
 
 def _setting(results: Results) -> dict[str, Any]:
     analysis = Analysis(results)
-    groups = _groups(analysis)
-    seeds = sorted({cell.seed for cell in results.cells})
+    groups = story.groups_of(analysis)
+    seeds = sorted({cell.seed for cell in results.cells if not cell.failed})
     return {
         "describe": results.setting.describe(),
         "quick": results.setting.budget == "quick",
-        "budget_lines": sorted({m["budget_line"] for m in results.manifests if m["budget_line"]}),
+        "budget_lines": budget_lines(results),
         "seeds": seeds,
+        "all_failed": analysis.failed(),
+        "warnings": _warnings(results),
         "families": results.families,
         "n_cells": len(results.cells),
         "unfinished": results.unfinished,
@@ -79,7 +81,7 @@ def _setting(results: Results) -> dict[str, Any]:
         "failed": _failed(results),
         "groups": [_group(analysis, group, level) for group, level in groups],
         "levels": story.by_level(analysis),
-        "datasets": [_dataset(analysis, name) for name in results.datasets],
+        "datasets": [_dataset(analysis, name) for name in results.datasets if name not in analysis.failed()],
         "n_findings": sum(math.isfinite(found.improvement.value) for found in analysis.all_findings()),
         "doubts": _doubts(analysis),
         "costs": _costs(results),
@@ -87,21 +89,6 @@ def _setting(results: Results) -> dict[str, Any]:
         "commands": [manifest["command"] for manifest in results.manifests],
         "tables": all_tables(analysis),
     }
-
-
-def _groups(analysis: Analysis) -> list[tuple[story.Group, str | None]]:
-    """Return the groups of datasets whose improvements are averaged, and the level of the paper's numbers of each."""
-    groups: list[tuple[story.Group, str | None]] = []
-    for level in paper.LEVELS:
-        names = [name for task in paper.TASKS if (name := adroit_dataset(analysis, level, task))]
-        if names:
-            others = stand_ins_of(names)
-            title = f"Adroit {level}: {len(names)} of 4 tasks"
-            title += f" ({len(others)} stand-ins: {', '.join(others)})" if others else ""
-            groups.append(((title, names), level))
-    adroit = {name for (_, names), _ in groups for name in names}
-    groups += [((name, [name]), None) for name in analysis.with_truth() if name not in adroit]
-    return groups
 
 
 def _group(analysis: Analysis, group: story.Group, level: str | None) -> dict[str, Any]:
@@ -205,6 +192,16 @@ def _failed(results: Results) -> list[dict[str, str]]:
     return [{"reason": reason, "cells": "; ".join(cells)} for reason, cells in reasons.items()]
 
 
+def _warnings(results: Results) -> list[tuple[str, int]]:
+    """Return what estimators warned of, numbers left out, and in how many cells; the commonest first."""
+    counts: dict[str, int] = {}
+    for cell in results.cells:
+        texts = {re.sub(r"-?\d[\d.,]*(e[+-]?\d+)?", "#", text) for text in cell.record.get("warnings", ())}
+        for text in texts:
+            counts[text] = counts.get(text, 0) + 1
+    return sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
+
+
 def _doubts(analysis: Analysis) -> list[tuple[str, int]]:
     """Return how often each source of uncertainty is the largest, of the means over estimators, the commonest first."""
     counts: dict[str, int] = {}
@@ -236,6 +233,3 @@ def _environments(results: Results) -> list[str]:
         for cell in results.cells
     }
     return sorted(texts)
-
-
-__all__ = ["NONE", "TEMPLATE", "make_page", "write_page"]

@@ -52,6 +52,11 @@ class Plan:
         """Return the jobs that have a cell without a finished file in `folder`."""
         return tuple(job for job in self.jobs if any(finished(cell_path(folder, cell)) is None for cell in job.cells()))
 
+    def superseded(self, folder: Path) -> int:
+        """Return how many of the plan's cells `folder` holds only for other settings, data or versions."""
+        cells = [cell for job in self.jobs for cell in job.cells() if not cell_path(folder, cell).exists()]
+        return sum(any(folder.glob(f"{cell.place}-*.safetensors")) for cell in cells)
+
 
 def make_plan(
     suite: Suite,
@@ -98,7 +103,12 @@ def write_manifest(folder: Path, plan: Plan, *, seeds: Sequence[int], device: st
 
     The same run again gives the same file name; runs of other suites, seeds or settings have files of their own, so
     that the parts of a benchmark can be computed in one folder or brought together in one.
+
+    Raises:
+        ConfigurationError: for a plan without jobs.
     """
+    if not plan.jobs:
+        raise ConfigurationError(f"There is nothing to run: {plan.missing}.")
     variants = {job.variant.name: job.variant for job in plan.jobs}
     asked = {
         "suite": plan.suite.name,
@@ -106,8 +116,8 @@ def write_manifest(folder: Path, plan: Plan, *, seeds: Sequence[int], device: st
         "variants": {name: variant.description() for name, variant in variants.items()},
         "seeds": list(seeds),
         "missing": plan.missing,
-        "question": plan.jobs[0].question if plan.jobs else None,
-        "budget": plan.jobs[0].budget if plan.jobs else None,
+        "question": plan.jobs[0].question,
+        "budget": plan.jobs[0].budget,
     }
     told: dict[str, Any] = canonical(asked)
     told |= {
@@ -116,7 +126,9 @@ def write_manifest(folder: Path, plan: Plan, *, seeds: Sequence[int], device: st
         "truths": {name: _truth(truth) for name, truth in plan.truths.items()},
         "jobs_order": list(variants),
         "notes": {name: variant.note for name, variant in variants.items()},
-        "budget_line": plan.jobs[0].budget.describe() if plan.jobs else "",
+        "budget_line": plan.jobs[0].budget.describe(),
+        "grounds": canonical({job.dataset: job.ground for job in plan.jobs}),
+        "augmented": {f"{job.dataset}/{job.variant.name}-{job.seed}": job.name for job in plan.jobs},
         "cells": {cell.place: cell.fingerprint for job in plan.jobs for cell in job.cells()},
         "environment": environment(device),
         "command": command,
@@ -137,9 +149,22 @@ def read_manifests(folder: Path) -> list[dict[str, Any]]:
     """Return the manifests of a folder of results, the oldest first.
 
     Raises:
-        ConfigurationError: where there is none: nothing was run there.
+        ConfigurationError: where there is none (nothing was run there), or one that this version cannot read.
     """
-    found: list[dict[str, Any]] = [json.loads(path.read_text()) for path in sorted((folder / "runs").glob("*.json"))]
+    found = [_read_manifest(path) for path in sorted((folder / "runs").glob("*.json"))]
     if not found:
         raise ConfigurationError(f"{folder} holds no results: run `oat-gym bench --suite quick --out {folder}` first.")
     return sorted(found, key=lambda manifest: float(manifest["started"]))
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    try:
+        told = json.loads(path.read_text())
+    except ValueError:
+        told = None
+    if not isinstance(told, dict) or not {"augmented", "grounds", "truths", "question", "started"} <= set(told):
+        raise ConfigurationError(
+            f"{path} was written by another version of oat_gym, or is damaged. Delete it and run `oat-gym bench` again "
+            "with the same options (cells that are still valid are kept), or give another folder with --out."
+        )
+    return told

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from oat_gym.benchmark.plan import read_manifests
+from oat_gym.benchmark.protocol import Question
 from oat_gym.benchmark.scores import METRICS, score
 from oat_gym.benchmark.store import CellResult, read_augmented, read_cells
 from oat_gym.benchmark.variants import NONE
@@ -29,25 +30,32 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Setting:
-    """What cells must share to stand in one table: the budget and the question (`protocol.Question`)."""
+    """What cells must share to stand in one table: the budget's name and the question."""
 
     budget: str
-    initial: str
-    behavior: str
-    gamma: float | None
-    resets: int = 200
-    resamples: int = 400
+    question: Question
 
     @classmethod
     def of(cls, budget: str, question: Mapping[str, Any]) -> Setting:
-        """Return the setting of a budget's name and a question as a manifest or a cell holds it."""
-        return cls(budget, **{name: value for name, value in question.items() if name != "class"})
+        """Return the setting of a question as a manifest or a cell holds it."""
+        return cls(budget, Question(**{name: value for name, value in question.items() if name != "class"}))
+
+    @property
+    def slug(self) -> str:
+        """A name for its folder of tables."""
+        changed = (f"{name}-{value}" for name, value in self._unusual())
+        return "-".join((self.budget, self.question.initial, self.question.behavior, *changed))
 
     def describe(self) -> str:
         """Return it in words."""
-        where = "the environment's first states" if self.initial == "reset" else "the data's first states"
-        gamma = "" if self.gamma is None else f", gamma {self.gamma}"
-        return f"budget {self.budget!r}, values from {where}, behaviour policy {self.behavior!r}{gamma}"
+        where = "the environment's first states" if self.question.initial == "reset" else "the data's first states"
+        changed = "".join(f", {name} {value}" for name, value in self._unusual())
+        return f"budget {self.budget!r}, values from {where}, behaviour policy {self.question.behavior!r}{changed}"
+
+    def _unusual(self) -> list[tuple[str, Any]]:
+        names = ("gamma", "resets", "resamples")
+        pairs = [(name, getattr(self.question, name)) for name in names]
+        return [(name, value) for name, value in pairs if value != getattr(Question(), name)]
 
 
 @dataclass(frozen=True)
@@ -106,15 +114,16 @@ def read_results(folder: Path) -> tuple[Results, ...]:
     """Return what a folder holds, the settings in the order in which they were first run.
 
     Raises:
-        ConfigurationError: where nothing was run there.
+        ConfigurationError: where nothing was run there, or by another version.
     """
-    manifests, cells, augmented = read_manifests(folder), list(read_cells(folder)), read_augmented(folder)
-    settings = dict.fromkeys(_manifest_setting(manifest) for manifest in manifests if manifest["question"])
+    manifests, cells = read_manifests(folder), list(read_cells(folder))
+    settings = dict.fromkeys(_manifest_setting(manifest) for manifest in manifests)
     found: list[Results] = []
-    for setting in settings or {Setting("", "reset", "clone", None): None}:
-        own = [m for m in manifests if not m["question"] or _manifest_setting(m) == setting]
+    for setting in settings:
+        own = [manifest for manifest in manifests if _manifest_setting(manifest) == setting]
         members = [cell for cell in cells if _cell_setting(cell) == setting]
-        made = [pair for pair in augmented if pair[1]["budget"] == setting.budget]
+        names = {place: name for manifest in own for place, name in manifest["augmented"].items()}
+        made = read_augmented(folder, list(names.values()))
         found.append(Results(setting, tuple(with_truth(comparable(members), own)), tuple(own), tuple(made)))
     return tuple(found)
 
@@ -130,15 +139,17 @@ def _cell_setting(cell: CellResult) -> Setting:
 def comparable(cells: Iterable[CellResult]) -> list[CellResult]:
     """Return the newest cell of each place in the tables that shares all but the method with its comparison.
 
-    The comparison is the newest cell without augmentation of the dataset and estimator (where there is none, the
-    newest of any variant): cells of other data, policies, horizons, discounts, versions or settings of the estimator
-    are left out, and so are cells of a variant's earlier settings. A warning counts them.
+    The comparison is the newest finished cell without augmentation, of the dataset and of the dataset and estimator
+    (where there is none, the newest of any variant). Cells of other data, policies, horizons, discounts or starts than
+    the dataset's are left out, of other versions or settings of the estimator than the estimator's, and those of a
+    variant's earlier settings. A warning counts them.
     """
     ordered = sorted(cells, key=lambda cell: (float(cell.record["finished"]), cell.record["fingerprint"]))
-    grounds: dict[tuple[str, str], str] = {}
-    for cell in sorted(ordered, key=lambda cell: cell.variant == NONE):  # stable: the newest plain cell comes last
-        grounds[cell.dataset, cell.family] = _shared(cell)
-    matching = [cell for cell in ordered if _shared(cell) == grounds[cell.dataset, cell.family]]
+    compared = sorted(ordered, key=lambda cell: (not cell.failed, cell.variant == NONE))  # stable: the newest is last
+    grounds = {cell.dataset: _ground(cell) for cell in compared}
+    standing = [cell for cell in compared if _ground(cell) == grounds[cell.dataset]]
+    shared = {(cell.dataset, cell.family): _shared(cell) for cell in standing}
+    matching = [cell for cell in ordered if _shared(cell) == shared.get((cell.dataset, cell.family))]
     methods = {(cell.dataset, cell.variant): cell.record["config"]["variant"] for cell in matching}
     kept = {
         (cell.dataset, cell.variant, cell.family, cell.seed): cell
@@ -150,18 +161,31 @@ def comparable(cells: Iterable[CellResult]) -> list[CellResult]:
     return [kept[place] for place in sorted(kept)]
 
 
+def _ground(cell: CellResult) -> str:
+    return _valued(cell.record["config"]["ground"])
+
+
+def _valued(ground: Mapping[str, Any]) -> str:
+    """Return what values are of: all of a ground but what computed them."""
+    return json.dumps({name: value for name, value in ground.items() if name != "computed"}, sort_keys=True)
+
+
 def _shared(cell: CellResult) -> str:
-    """Return what two cells must have in common to be compared."""
+    """Return what two cells of an estimator must have in common to be compared."""
     shared = {name: value for name, value in cell.record["config"].items() if name not in ("variant", "seed")}
     return json.dumps(shared, sort_keys=True)
 
 
 def with_truth(cells: Iterable[CellResult], manifests: Sequence[Mapping[str, Any]]) -> Iterator[CellResult]:
-    """Give the cells with the true values that the last run knew, which may be better than when they were made."""
-    known = {name: truth for manifest in manifests for name, truth in manifest["truths"].items()}
+    """Give the cells with the true values that the last run on their ground knew: better ones may have been made."""
+    known = {
+        (name, _valued(manifest["grounds"][name])): truth
+        for manifest in manifests
+        for name, truth in manifest["truths"].items()
+    }
     for cell in cells:
-        truth = known.get(cell.dataset)
-        if truth is None or not set(cell.policies) <= set(truth):
+        truth = known.get((cell.dataset, _ground(cell)))
+        if truth is None or cell.failed:
             yield cell
             continue
         pairs = np.array([truth[name] for name in cell.policies], dtype=np.float64).reshape(-1, 2)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import statistics
-import time
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +27,7 @@ class Pace:
 
     A job that is still open is expected to cost the median of the finished ones of its dataset and variant; of its
     dataset and any variant; of its variant; of all: the first of these of which one is finished. The rest's costs are
-    divided by the number of workers that were busy so far, measured as the CPU seconds of a wall second.
+    divided by the number of workers.
     """
 
     open: dict[tuple[str, str, int], Job]
@@ -167,8 +166,3 @@ def format_seconds(seconds: float | None) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60} s"
     return f"{whole // 3600} h {whole % 3600 // 60} min"
-
-
-def now() -> str:
-    """Return the date and time in UTC, for reports."""
-    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())

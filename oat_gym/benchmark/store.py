@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,14 +128,14 @@ def write_augmented(folder: Path, name: str, arrays: Arrays, value: Mapping[str,
     write_sealed(path, arrays, dict(value))
 
 
-def read_augmented(folder: Path) -> list[tuple[Arrays, dict[str, Any]]]:
-    """Return (arrays, value) of every readable job of a folder of results, in the order of the file names."""
+def read_augmented(folder: Path, names: Iterable[str]) -> list[tuple[Arrays, dict[str, Any]]]:
+    """Return (arrays, value) of those of some jobs (`Job.name`) that are there and readable."""
     found: list[tuple[Arrays, dict[str, Any]]] = []
-    for path in sorted((folder / "augmented").rglob("*.safetensors")):
-        if path.name.startswith("."):
-            continue
+    for name in names:
         try:
-            found.append(read_sealed(path))
+            found.append(read_sealed(folder / f"{name}.safetensors"))
+        except FileNotFoundError:
+            continue
         except CacheError as error:
             _log.warning("%s It is left out of the report.", error)
     return found

@@ -46,18 +46,43 @@ class Picture:
         return cls(base64.b64encode(figures.to_png(figure)).decode(), caption, alt or caption)
 
 
-def sentence(found: Finding, *, of: str) -> str:
-    """Return a finding in words: by how much, how sure, and the verdict.
+def groups_of(analysis: Analysis) -> list[tuple[Group, str | None]]:
+    """Return the groups of datasets whose improvements are averaged, and the level of the paper's numbers of each.
 
-    >>> sentence.__name__
-    'sentence'
+    Only tasks of one level are: other datasets may share episodes or policies and are not independent.
     """
+    groups: list[tuple[Group, str | None]] = []
+    for level in paper.LEVELS:
+        names = [name for task in paper.TASKS if (name := adroit_dataset(analysis, level, task))]
+        if names:
+            others = stand_ins_of(names)
+            title = f"Adroit {level}: {len(names)} of 4 tasks"
+            title += f" ({len(others)} stand-ins: {', '.join(others)})" if others else ""
+            groups.append(((title, names), level))
+    adroit = {name for (_, names), _ in groups for name in names}
+    groups += [((name, [name]), None) for name in analysis.with_truth() if name not in adroit]
+    return groups
+
+
+def part_of(found: Finding, analysis: Analysis, group: Group) -> str:
+    """Return which estimators and how many datasets a mean is of, where that is not all of them; else ""."""
+    parts: list[str] = []
+    if found.family == MEAN and set(found.families) != set(analysis.results.families):
+        parts.append(f"{', '.join(found.families)} only")
+    if len(found.datasets) < len(group[1]):
+        parts.append(f"{len(found.datasets)} of {len(group[1])} datasets")
+    return "; ".join(parts)
+
+
+def sentence(found: Finding, *, of: str, part: str = "") -> str:
+    """Return a finding in words: by how much, how sure, and the verdict; `part` says what a mean is of."""
     change = found.improvement
     if not math.isfinite(change.value):
         return f"{of}: not measured."
     better = change.value >= 0
-    size, low, high = (format_number(number) for number in (abs(change.value), change.low, change.high))
-    ends = f"95% interval {low} to {high}"
+    ends = (change.low, change.high) if better else (-change.high, -change.low)
+    size, low, high = (format_number(number) for number in (abs(change.value), *ends))
+    ends = f"95% interval {low} to {high}" + (f"; {part}" if part else "")
     what = {
         "mae": f"{'lowers' if better else 'raises'} the error by {size}% ({ends})",
         "rank_correlation": f"{'raises' if better else 'lowers'} the rank correlation by {size} ({ends})",
@@ -74,7 +99,9 @@ def summary_rows(analysis: Analysis, group: Group) -> list[dict[str, Any]]:
         if variant == NONE:
             continue
         found = {metric: analysis.over(group[1], variant, MEAN, metric) for metric in METRICS}
-        rows.append({"variant": variant, "note": note(variant), "cells": [_verdict(each) for each in found.values()]})
+        part = next((part_of(each, analysis, group) for each in found.values() if each is not None), "")
+        text = f"{note(variant)} ({part})" if part else note(variant)
+        rows.append({"variant": variant, "note": text, "cells": [_verdict(each) for each in found.values()]})
     return rows
 
 
@@ -108,7 +135,7 @@ def best_sentences(analysis: Analysis, group: Group) -> list[str]:
     ]
     errors = {each.variant: each.improvement.value for each in found if each.metric == "mae"}
     found.sort(key=lambda each: (-errors.get(each.variant, -math.inf), each.variant, each.metric != "mae"))
-    return [sentence(each, of=each.variant) for each in found]
+    return [sentence(each, of=each.variant, part=part_of(each, analysis, group)) for each in found]
 
 
 def bars(analysis: Analysis, group: Group, *, family: str = MEAN, level: str | None = None) -> Picture | None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from oat_gym.benchmark import paper
 from oat_gym.benchmark.analysis import MEAN, Analysis, Finding
+from oat_gym.benchmark.results import Results
 from oat_gym.benchmark.scores import METRICS, Metric
 from oat_gym.benchmark.variants import NONE, VARIANTS
 from oat_gym.cache import write_atomically
@@ -145,7 +146,7 @@ def improvement_table(analysis: Analysis) -> Table | None:
 def _improvement_row(found: Finding) -> tuple[str, ...]:
     change = found.improvement
     numbers = [format_number(number) for number in (change.before, change.after, change.value, change.low, change.high)]
-    head = (found.dataset, found.variant, found.family, METRICS[found.metric])
+    head = (found.datasets[0], found.variant, found.family, METRICS[found.metric])
     return (*head, *numbers, change.verdict, str(change.n_seeds), change.parts.main)
 
 
@@ -260,11 +261,20 @@ def _notes(analysis: Analysis, datasets: dict[str, str | None]) -> str:
     """Return what a caption must say: setting, seeds, budget, signs, stand-ins."""
     there = [name for name in datasets.values() if name is not None]
     seeds = {cell.seed for cell in analysis.results.cells if cell.dataset in there and not cell.failed}
-    lines = {manifest["budget_line"] for manifest in analysis.results.manifests if manifest["budget_line"]}
     text = f"{len(seeds)} seeds, mean ± standard deviation; {analysis.results.setting.describe()}; "
-    text += "; ".join(sorted(lines)) + ". + or - : better or worse than no augmentation, 95% interval excludes zero."
+    text += (
+        "; ".join(budget_lines(analysis.results))
+        + ". + or - : better or worse than no augmentation, 95% interval excludes zero."
+    )
     stand_ins = stand_ins_of(there)
     return text + (f" Stand-ins, not the paper's data: {', '.join(stand_ins)}." if stand_ins else "")
+
+
+def budget_lines(results: Results) -> list[str]:
+    """Return what the budgets of the runs that gave the cells were."""
+    there = {cell.record["fingerprint"] for cell in results.cells}
+    made = [manifest for manifest in results.manifests if there & set(manifest["cells"].values())]
+    return sorted({manifest["budget_line"] for manifest in made})
 
 
 def stand_ins_of(datasets: Sequence[str]) -> list[str]:

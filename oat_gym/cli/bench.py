@@ -17,11 +17,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from oat_gym.benchmark.analysis import Analysis
 from oat_gym.benchmark.budget import BUDGETS, Budget
 from oat_gym.benchmark.job import JobReport
-from oat_gym.benchmark.plan import Plan, make_plan, write_manifest
+from oat_gym.benchmark.plan import Plan, make_plan, read_manifests, write_manifest
 from oat_gym.benchmark.protocol import SUITES, Question, Suite, find_suite
 from oat_gym.benchmark.results import Results, read_results, write_tidy
 from oat_gym.benchmark.runner import Listener, Pace, format_seconds, run
-from oat_gym.benchmark.story import best_sentences
+from oat_gym.benchmark.story import best_sentences, groups_of
 from oat_gym.benchmark.tables import all_tables, write_tables
 from oat_gym.benchmark.variants import VARIANTS, Variant, find_variant, parse_variants
 from oat_gym.cli._shared import check_choice, out
@@ -130,6 +130,8 @@ def _check_folder(folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise ConfigurationError(f"--out must be a folder, and {str(folder)!r} is a file: give another name.")
     folder.mkdir(parents=True, exist_ok=True)
+    if (folder / "runs").exists():
+        read_manifests(folder)  # now, not after hours of computing
 
 
 def _check_device(device: str) -> None:
@@ -148,6 +150,12 @@ def _tell_plan(plan: Plan, folder: Path) -> None:
     for name, why in plan.unknown_truth.items():
         out.print(f"  {name}: no error can be computed. {why}", markup=False)
     open_jobs = len(plan.open_jobs(folder))
+    others = plan.superseded(folder)
+    if others:
+        out.print(
+            f"  {others} cells of {folder} are of other settings, data or library versions than this run's: they are "
+            "kept, and computed again for this one."
+        )
     out.print(
         f"{plan.n_cells} cells in {len(plan.jobs)} jobs, {len(plan.jobs) - open_jobs} of them finished, in {folder}"
     )
@@ -196,15 +204,14 @@ def _tell_failures(reports: list[JobReport]) -> None:
 def _finish(results: Results, folder: Path) -> None:
     """Write tables and tidy files of a setting, and print what was found."""
     setting = results.setting
-    where = folder / "tables" / f"{setting.budget}-{setting.initial}-{setting.behavior}"
+    where = folder / "tables" / setting.slug
     analysis = Analysis(results)
     if not results.cells:
         return
     write_tidy(results, where)
     write_tables(all_tables(analysis), where)
-    known = analysis.with_truth()
-    if known:
-        out.print(f"Averages over {', '.join(results.families)} and {', '.join(known)}, {setting.describe()}:")
-        for line in best_sentences(analysis, ("all", known)):
+    for group, _ in groups_of(analysis):
+        out.print(f"{group[0]}, averages over {', '.join(results.families)}, {setting.describe()}:", markup=False)
+        for line in best_sentences(analysis, group):
             out.print(f"  {line}")
     out.print(f"Tables: {where}")

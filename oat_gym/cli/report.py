@@ -25,5 +25,7 @@ def report(
     """
     if not folder.is_dir():
         raise ConfigurationError(f"{str(folder)!r} is no folder of results: run `oat-gym bench --out {folder}` first.")
+    if file is not None and file.is_dir():
+        file /= "report.html"
     page = write_page(folder, file or folder / "report.html", pictures=pictures)
     out.print(f"Report: {page}")

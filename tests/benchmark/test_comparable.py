@@ -1,6 +1,7 @@
 """Which cells may stand beside each other: another question, policy, dataset, version or setting is another cell."""
 
 import dataclasses
+import json
 import logging
 from functools import partial
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from oat_gym import ope
+from oat_gym.benchmark import job as job_module
 from oat_gym.benchmark.ground import survey, tell_apart
 from oat_gym.benchmark.plan import Plan, make_plan, write_manifest
 from oat_gym.benchmark.protocol import Catalog, Question
@@ -16,7 +18,8 @@ from oat_gym.benchmark.results import read_results
 from oat_gym.benchmark.runner import run
 from oat_gym.benchmark.variants import parse_variants
 from oat_gym.domains import Task, Truth
-from oat_gym.errors import InvalidDataError
+from oat_gym.errors import ConfigurationError, InvalidDataError
+from oat_gym.ope.problem import Problem
 from oat_gym.source import Source
 from tests.benchmark import tiny
 
@@ -98,6 +101,7 @@ def test_cells_of_other_grounds_and_earlier_settings_are_left_out(
     assert {(cell.variant, cell.seed) for cell in results.cells} == {("none", 0), ("jittering", 0)}
     assert len(results.cells) == 4
     assert "8 cells of older settings" in caplog.text
+    assert (plan_of(changed, seeds=(0, 1)).superseded(tmp_path), plan_of(changed).superseded(tmp_path)) == (4, 0)
     assert len({str(cell.record["config"]["ground"]) for cell in results.cells}) == 1
 
 
@@ -105,7 +109,7 @@ def test_questions_of_other_sizes_are_settings_of_their_own(tmp_path: Path) -> N
     compute(plan_of(), tmp_path)
     compute(plan_of(question=dataclasses.replace(QUESTION, resamples=30)), tmp_path)
     found = read_results(tmp_path)
-    assert [results.setting.resamples for results in found] == [20, 30]
+    assert [results.setting.question.resamples for results in found] == [20, 30]
     assert [len(results.cells) for results in found] == [4, 4]
     assert all(results.unfinished == 0 for results in found)
 
@@ -126,6 +130,74 @@ def test_true_values_are_those_of_the_last_run(tmp_path: Path) -> None:
     for old, new in zip(before, after, strict=True):
         np.testing.assert_allclose(new.true, old.true + 1.0)
         np.testing.assert_array_equal(new.values, old.values)
+
+
+def test_a_truth_is_of_its_ground_only(tmp_path: Path) -> None:
+    """Another policy of the same name has another value; the estimators that did not see it are left out."""
+
+    def other_truth(gamma: float) -> Truth:
+        truth = tiny.truth(gamma)
+        return dataclasses.replace(truth, values={**truth.values, "weak": 100.0})
+
+    compute(plan_of(), tmp_path)
+    first = read_results(tmp_path)[0].cells
+    changed = catalog_with(policies=other_policies, truth=other_truth)
+    compute(plan_of(changed, budget=tiny.BUDGET.choose("is")), tmp_path, changed)
+    second = read_results(tmp_path)[0].cells
+    assert {cell.family for cell in second} == {"IS"}
+    assert all(cell.true[1] == 100.0 for cell in second)
+    write_manifest(tmp_path, plan_of(), seeds=[0], device="cpu", command="again")  # nothing of it is computed anew
+    third = read_results(tmp_path)[0].cells
+    assert [cell.true.tolist() for cell in third] == [cell.true.tolist() for cell in second]
+    assert first[0].true[1] != 100.0
+
+
+def test_a_failed_run_does_not_push_out_finished_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compute(plan_of(), tmp_path)
+    later = catalog_with(horizon=9)
+
+    def broken(*_: object, **__: object) -> None:
+        raise InvalidDataError("a damaged file")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(job_module.ope, "evaluate", broken)
+        compute(plan_of(later), tmp_path, later)
+    (results,) = read_results(tmp_path)
+    assert [cell.failed for cell in results.cells] == [False] * 4
+
+
+def test_estimates_that_are_no_numbers_are_a_failed_cell(tmp_path: Path) -> None:
+    budget = dataclasses.replace(tiny.BUDGET, estimators=(("fqe", _NoNumbers()), tiny.BUDGET.estimators[1]))
+    compute(plan_of(budget=budget), tmp_path)
+    cells = {(cell.variant, cell.family): cell for cell in read_results(tmp_path)[0].cells}
+    assert cells["none", "FQE"].reason == "the estimates of fair are not finite"
+    assert not cells["none", "IS"].failed
+
+
+class _NoNumbers(ope.FQE):
+    def estimate(self, problem: Problem, *, seeds: tuple[int, ...]) -> tuple[ope.Estimates, ...]:
+        values = np.array([0.0, 1.0, np.nan, 3.0, 4.0, 5.0])
+        draws = np.repeat(values[:, None], len(problem.resamples), axis=1)
+        return (ope.Estimates(values, draws, tuple({} for _ in values)),)
+
+
+def test_what_was_mined_and_generated_is_that_of_the_last_run(tmp_path: Path) -> None:
+    compute(plan_of(), tmp_path)
+    other = dataclasses.replace(tiny.BUDGET, name="other")
+    compute(plan_of(budget=other), tmp_path)
+    assert [len(results.augmented) for results in read_results(tmp_path)] == [2, 2]
+    assert [results.setting.slug for results in read_results(tmp_path)] == [
+        f"{name}-reset-clone-resets-5-resamples-20" for name in ("tiny", "other")
+    ]
+
+
+@pytest.mark.parametrize("change", [None, "truths", "augmented"])
+def test_a_manifest_of_another_version_is_named(change: str | None, tmp_path: Path) -> None:
+    path = write_manifest(tmp_path, plan_of(), seeds=[0], device="cpu", command="bench")
+    told = json.loads(path.read_text())
+    path.write_text("{" if change is None else json.dumps({key: told[key] for key in told if key != change}))
+    with pytest.raises(ConfigurationError, match="another version of oat_gym, or is damaged"):
+        read_results(tmp_path)
 
 
 def test_a_damaged_dataset_is_named_and_the_rest_is_planned() -> None:

@@ -45,6 +45,18 @@ def test_where_nothing_changes_the_interval_holds_zero_in_about_95_percent(metri
     assert found / 120 <= 0.09  # the nominal 5%, and two standard errors of 120 trials above it
 
 
+def test_seeds_in_which_a_metric_is_undefined_do_not_count() -> None:
+    """Equal estimates have no ranks: of three seeds one is left, and one seed never decides."""
+    true = np.arange(5.0)
+    flat, ranked = np.zeros(5), np.arange(5.0)
+    before = np.stack([ranked[::-1], flat, flat])
+    after = np.stack([ranked, ranked, ranked])
+    sides = [(values, np.repeat(values[..., None], B, axis=2)) for values in (before, after)]
+    change = _improve(true, *sides, "rank_correlation")
+    assert (change.n_seeds, change.verdict) == (1, "no evidence")
+    assert change.value == pytest.approx(2.0)
+
+
 @pytest.mark.parametrize("ratio", [0.5, 2.0])
 def test_a_known_improvement_is_covered(ratio: float) -> None:
     """Errors are scaled by `ratio`: over seeds and policies, the expected error changes by 100 (1 - ratio) percent."""

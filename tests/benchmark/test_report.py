@@ -12,10 +12,11 @@ import pytest
 from oat_gym.benchmark import figures, paper
 from oat_gym.benchmark.analysis import Analysis
 from oat_gym.benchmark.page import make_page
+from oat_gym.benchmark.protocol import Question
 from oat_gym.benchmark.results import Results, Setting, cell_rows, estimate_rows, to_csv, write_tidy
 from oat_gym.benchmark.scores import METRICS
 from oat_gym.benchmark.store import CellResult, read_result, write_result
-from oat_gym.benchmark.story import sentence
+from oat_gym.benchmark.story import best_sentences, groups_of, sentence
 from oat_gym.benchmark.tables import all_tables, paper_table, write_tables
 from oat_gym.errors import CacheError, ConfigurationError
 
@@ -59,7 +60,9 @@ def results_of(datasets: dict[str, bool], *, seeds: int = 3, extra: tuple[CellRe
         "jobs_order": list(ERRORS), "missing": {"adroit-pen-human": "run `minari download D4RL/pen/human-v2`"},
         "cells": {}, "budget_line": "budget 'full'", "command": "oat-gym bench", "started": time.time(),
     }  # fmt: skip
-    return Results(Setting("full", "reset", "clone", None), (*cells, *extra), (manifest,), ())
+    members = (*cells, *extra)
+    manifest["cells"] = {str(number): part.record["fingerprint"] for number, part in enumerate(members)}
+    return Results(Setting("full", Question()), members, (manifest,), ())
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +79,10 @@ def test_verdicts_follow_the_errors(analysis: Analysis) -> None:
     assert "lowers the error by" in sentence(verdicts["oat-paper"], of="OAT")
     assert sentence(verdicts["oat-paper"], of="OAT").endswith("helps.")
     assert analysis.finding("logs", "oat-paper", "mean", "mae") is None
-    assert analysis.without_truth() == ("logs",)
+    assert analysis.with_truth() == ("adroit-door-human",)
+    worse = sentence(verdicts["scaling"], of="scaling")
+    numbers = [float(part) for part in re.findall(r"-?\d+(?:\.\d+)?", worse.split("%", 1)[1].replace("95%", ""))]
+    assert "raises the error by 120%" in worse and numbers[0] < 120 < numbers[1]  # the interval is of the same sign
 
 
 def test_a_family_that_failed_on_one_side_is_left_out_of_the_mean_of_both() -> None:
@@ -86,6 +92,11 @@ def test_a_family_that_failed_on_one_side_is_left_out_of_the_mean_of_both() -> N
         "adroit-door-human", "scaling", "mean", "mae"
     )
     assert found.families == ("FQE",)
+    partial = Analysis(Results(whole.setting, kept, whole.manifests, ()))
+    (group, _), *_ = groups_of(partial)
+    told = {line.split()[0]: line for line in best_sentences(partial, group) if "error" in line}
+    assert "FQE only" in told["scaling"] and "only" not in told["jittering"]
+    assert "FQE only" in make_page((partial.results,))
     assert found.improvement.before == pytest.approx(100, abs=2)
 
 

@@ -39,7 +39,7 @@ from oat_gym.benchmark.scores import METRICS
 from oat_gym.benchmark.tables import Table, write_tables
 from oat_gym.benchmark.variants import NONE, VARIANTS, Variant
 
-JITTERS = (0.01, 0.03, 0.1, 0.3)
+JITTERS = (0.03, 0.1, 0.3)
 SCALES = (0.1, 0.3, 3.0)
 QUESTION = Question()
 
@@ -121,8 +121,8 @@ def tables(out: Path, to: Path) -> None:
         folder = out / _slug(change.name)
         if folder.exists():
             found += [(change.name, Analysis(results)) for results in read_results(folder)]
-    if not found:
-        raise SystemExit(f"{out} holds no results: use `run` first.")
+    if not found or found[0][0] != NONE:
+        raise SystemExit(f"{out} holds no results of the unchanged evaluation: use `run` first.")
     rows = [row for name, analysis in found for row in _rows(name, analysis)]
     results = found[0][1].results
     header = ("dataset", "estimator", "change", *METRICS.values(), "bias", "seeds")
