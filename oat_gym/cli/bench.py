@@ -130,7 +130,7 @@ def _check_folder(folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise ConfigurationError(f"--out must be a folder, and {str(folder)!r} is a file: give another name.")
     folder.mkdir(parents=True, exist_ok=True)
-    if (folder / "runs").exists():
+    if any((folder / "runs").glob("*.json")):
         read_manifests(folder)  # now, not after hours of computing
 
 

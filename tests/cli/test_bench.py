@@ -29,6 +29,11 @@ def test_a_suite_runs_resumes_and_becomes_a_page(tmp_path: Path) -> None:
     assert "8 cells in 4 jobs, 0 of them finished" in first.output
     assert "jittering" in first.output
     assert "the error by" in first.output
+    (manifest,) = (tmp_path / "runs").glob("*.json")
+    manifest.write_text("{}")
+    with pytest.raises(ConfigurationError, match="another version"):  # before anything is computed
+        CliRunner().invoke(cli.app, arguments, catch_exceptions=False)
+    manifest.unlink()
     again = CliRunner().invoke(cli.app, arguments, catch_exceptions=False)
     assert "4 of them finished" in again.output
     assert list(tmp_path.glob("tables/*/tables.md"))
