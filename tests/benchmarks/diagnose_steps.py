@@ -26,12 +26,11 @@ import numpy as np
 import numpy.typing as npt
 from minari import MinariDataset
 
-from oat_gym import AugmentedDataset
+from oat_gym import AugmentedDataset, domains
 from oat_gym._rng import derive
 from oat_gym.augmenters import Augmenter
 from oat_gym.benchmark.job import one_thread
 from oat_gym.benchmark.measure import environment
-from oat_gym.benchmark.protocol import Catalog
 from oat_gym.benchmark.variants import NONE, VARIANTS, Variant, find_variant, fit_length, on_device
 from oat_gym.cache import fingerprint, write_atomically
 from oat_gym.domains import maze2d_d4rl
@@ -49,8 +48,6 @@ from oat_gym.spaces import FlatSpace
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
-FORMAT = 1
-"""Changed where rows of older versions of this script would mean something else."""
 CATEGORY = 1e3
 """Distance between two categories of an action: more than between any two states."""
 BLOCK = 10_000
@@ -75,19 +72,19 @@ def push(states: FloatArray, actions: FloatArray, goals: FloatArray) -> Outcome:
     found, rewards = np.empty_like(states), np.empty(len(states))
     with open_maze() as env:
         env.reset(seed=0)
-        point, maze = env.get_wrapper_attr("point_env"), env.unwrapped
+        point, reward = env.get_wrapper_attr("point_env"), env.get_wrapper_attr("compute_reward")
         for row, (state, action, goal) in enumerate(zip(states, actions, goals, strict=True)):
             point.data.qacc_warmstart[:] = 0  # what the step before left must not matter
             point.set_state(state[:2], state[2:])
             found[row] = point.step(action)[0]
-            rewards[row] = float(maze.compute_reward(found[row, :2], goal, {}))
+            rewards[row] = float(reward(found[row, :2], goal, {}))
     return found, rewards, np.array([UMAZE.cell_of(state[:2]) not in UMAZE.free for state in states])
 
 
 def push_d4rl(states: FloatArray, actions: FloatArray) -> Outcome:
     """Return the same in D4RL's frame."""
-    forces, goals = maze2d_d4rl.pointmaze_actions(actions), np.zeros((len(states), 2))
-    found, _, in_wall = push(maze2d_d4rl.pointmaze_states(states), forces, goals)
+    forces = maze2d_d4rl.pointmaze_actions(actions).astype(np.float64)
+    found, _, in_wall = push(maze2d_d4rl.pointmaze_states(states), forces, goals=np.zeros((len(states), 2)))
     found = maze2d_d4rl.d4rl_states(found)
     return found, maze2d_d4rl.d4rl_rewards(found), in_wall
 
@@ -101,10 +98,7 @@ SIMULATORS: dict[str, Simulator] = {
 
 
 def simulator_errors(simulator: Simulator, steps: Steps, scale: Scale, prefix: str) -> dict[str, float]:
-    """Return errors of s' in standard deviations of a real change, of r in those of rewards, and the share in walls.
-
-    The first is the root mean square over steps and columns; `_median` is the median over steps of each one's own.
-    """
+    """Return errors of s' in sd of a real change, over steps and columns and of the median step, of r, and in walls."""
     next_states, rewards, in_wall = simulator(steps.states, steps.actions)
     each = root_mean_square((steps.next_states[:, -4:] - next_states) / scale.changes[1][-4:], axis=1)
     return {
@@ -179,17 +173,14 @@ class Subject:
     def levels(self) -> dict[str, float | None]:
         """What the real steps give themselves."""
         scale, recorded = self.judge.scale, replace(self.targets, actions=self.targets.steps.actions[None])
-        found: dict[str, float | None] = {"n_real": len(self.steps)}
-        found |= {"recorded_near": recorded.distance(self.points(), scale)}
-        found |= {"real_near": self.targets.distance(self.points(), scale)}
-        if self.simulator is None:
-            return found
-        errors = simulator_errors(self.simulator, self.sample(self.steps), scale, "check")
-        return found | {name: errors[name] for name in ("check_state", "check_reward")}
+        near = {"recorded_near": recorded, "real_near": self.targets}
+        found = {name: targets.distance(self.points(), scale) for name, targets in near.items()}
+        return {"n_real": len(self.steps), **found, **self.simulated(self.steps, "check")}
 
-    def sample(self, steps: Steps) -> Steps:
-        """Return the steps that the simulator sees."""
-        return steps.sample(self.limits.steps, derive(self.seed, "diagnosis", "simulated"))
+    def simulated(self, steps: Steps, prefix: str) -> dict[str, float]:
+        """Return the simulator's verdict on some of these steps, where there is a simulator."""
+        some = steps.sample(self.limits.steps, derive(self.seed, "diagnosis", "simulated"))
+        return simulator_errors(self.simulator, some, self.judge.scale, prefix) if self.simulator else {}
 
     def points(self, *generated: Steps) -> Steps:
         """Return the steps that neighbours are looked for in: the real ones, and generated ones where given."""
@@ -208,13 +199,11 @@ def diagnose(subject: Subject, augmenter: Augmenter, *, factor: float) -> dict[s
     found: dict[str, float | None] = {**subject.levels, "n_generated": len(generated)}
     found["share_generated"] = len(generated) / float(data.synthesis.lengths[data.synthesis.n_real :].sum())
     found |= changes(subject.steps, generated.take(in_equal_lengths(data)), scale)
-    if subject.simulator is not None:
-        found |= simulator_errors(subject.simulator, subject.sample(generated), scale, "simulator")
+    found |= subject.simulated(generated, "simulator")
     found |= {"model_state": scores.dynamics.value, "model_reward": scores.reward.value}
-    found |= {"seam": scores.seam_mean.value, "seam_p95": scores.seam_p95.value}
+    found |= {"seam": scores.seam_mean.value, "real_step": float(scale.sizes(subject.steps).mean())}
     real, both = subject.levels["real_near"], subject.targets.distance(subject.points(generated), scale)
-    found |= {"both_near": both, "near_ratio": both / real if real else None}
-    return found | {"real_step": float(scale.sizes(subject.steps).mean())}
+    return found | {"both_near": both, "near_ratio": both / real if real else None}
 
 
 def in_equal_lengths(data: AugmentedDataset) -> BoolArray:
@@ -223,8 +212,7 @@ def in_equal_lengths(data: AugmentedDataset) -> BoolArray:
     numbers = range(plan.n_real, plan.n_real + plan.count)
     parts = zip(data.storage.get_episode_metadata(numbers), numbers, strict=True)
     counts = [int(Provenance.from_metadata(metadata, number).mask.sum()) for metadata, number in parts]
-    sources = np.arange(plan.count) % plan.n_real
-    return np.repeat(plan.lengths[plan.n_real :] == plan.lengths[sources], counts)
+    return np.repeat(plan.lengths[plan.n_real :] == plan.lengths[np.arange(plan.count) % plan.n_real], counts)
 
 
 def changes(real: Steps, generated: Steps, scale: Scale) -> dict[str, float]:
@@ -235,14 +223,10 @@ def changes(real: Steps, generated: Steps, scale: Scale) -> dict[str, float]:
     here, there = (steps.episodes * stride + steps.numbers for steps in (real, generated))
     order = np.argsort(here)
     old = real.take(order[np.searchsorted(here, there, sorter=order)])
-    states, actions = np.split(scale.inputs(generated) - scale.inputs(old), [real.states.shape[1]], axis=1)
-    parts = {
-        "state": states,
-        "action": actions,
-        "reward": ((generated.rewards - old.rewards) / scale.rewards[1])[:, None],
-    }
-    whole = {"change": float(root_mean_square(np.hstack(list(parts.values()))))}
-    return whole | {f"change_{name}": float(root_mean_square(part)) for name, part in parts.items()}
+    rewards = (generated.rewards - old.rewards) / scale.rewards[1]
+    rows, width = np.hstack((scale.inputs(generated) - scale.inputs(old), rewards[:, None])), real.states.shape[1]
+    parts = {"": slice(None), "_state": slice(width), "_action": slice(width, -1), "_reward": slice(-1, None)}
+    return {f"change{name}": float(root_mean_square(rows[:, part])) for name, part in parts.items()}
 
 
 TABLES: dict[str, dict[str, str]] = {
@@ -253,7 +237,6 @@ TABLES: dict[str, dict[str, str]] = {
         "change_action": "of a",
         "change_reward": "of r",
         "seam": "seam jump",
-        "seam_p95": "its 95th percentile",
         "real_step": "a real step's change",
     },
     "Errors": {
@@ -276,25 +259,22 @@ TABLES: dict[str, dict[str, str]] = {
 """Title of each table -> column of the CSV -> its heading."""
 KEYS = ("dataset", "variant", "seed")
 COLUMNS = (
-    *KEYS,
-    *("n_real", "n_generated"),
+    *(*KEYS, "n_real", "n_generated"),
     *(column for columns in TABLES.values() for column in columns),
-    *("reason", "settings", "cpu_seconds", "commit", "versions"),
+    *("reason", "settings", *vars(Limits()), "cpu_seconds", "commit", "versions"),
 )
 Row = dict[str, str]
 
 
 def read_rows(path: Path) -> dict[tuple[str, ...], Row]:
     """Return the rows of a CSV by dataset, variant and seed."""
-    if not path.exists():
-        return {}
-    with path.open(newline="") as file:
-        return {tuple(row[key] for key in KEYS): row for row in csv.DictReader(file)}
+    lines = path.read_text().splitlines() if path.exists() else []
+    return {tuple(row[key] for key in KEYS): row for row in csv.DictReader(lines)}
 
 
 def write_rows(path: Path, rows: Iterable[Row]) -> None:
     text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=COLUMNS, lineterminator="\n", restval="")
+    writer = csv.DictWriter(text, fieldnames=COLUMNS, lineterminator="\n", restval="", extrasaction="ignore")
     writer.writeheader()
     writer.writerows(rows)
     write_atomically(path, text.getvalue().encode())
@@ -303,20 +283,21 @@ def write_rows(path: Path, rows: Iterable[Row]) -> None:
 def run(out: Path, datasets: list[str], variants: list[Variant], seeds: list[int], limits: Limits) -> None:
     """Compute the rows that are not there."""
     out.mkdir(parents=True, exist_ok=True)
-    path = out / "steps.csv"
+    path, where = out / "steps.csv", environment("cpu")
+    versions = ", ".join(f"{name} {where[name]}" for name in ("python", "numpy", "scikit-learn", "torch", "minari"))
+    told = {"commit": str(where["commit"]), "versions": versions, **{k: str(v) for k, v in vars(limits).items()}}
     for name, seed in itertools.product(datasets, seeds):
-        places = Catalog.installed()
-        policies = PolicySet.of(places.task_of(name)[1].policies())
-        subject = Subject(places.load(name), policies, SIMULATORS.get(name), seed, limits)
+        policies = PolicySet.of(domains.policies(name))
+        subject = Subject(domains.load(name), policies, SIMULATORS.get(name), seed, limits)
         for variant in variants:
-            settings = fingerprint(format=FORMAT, variant=variant.description(), limits=limits)[:12]
+            settings = fingerprint(variant=variant.description(), limits=limits)[:12]
             key = (name, variant.name, str(seed))
             if read_rows(path).get(key, {}).get("settings") == settings:
                 continue
             with one_thread(), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 row = measure(subject, variant)
-            row |= dict(zip(KEYS, key, strict=True)) | {"settings": settings} | _where()
+            row |= dict(zip(KEYS, key, strict=True)) | {"settings": settings} | told
             write_rows(path, (read_rows(path) | {key: row}).values())
             print(*key, row["cpu_seconds"], "CPU s", row.get("reason", ""), flush=True)
 
@@ -336,74 +317,58 @@ def measure(subject: Subject, variant: Variant) -> Row:
     return row | {"cpu_seconds": f"{time.process_time() - begun:.1f}"}
 
 
-def _where() -> Row:
-    found = environment("cpu")
-    versions = ", ".join(f"{name} {found[name]}" for name in ("python", "numpy", "scikit-learn", "torch", "minari"))
-    return {"commit": str(found["commit"]), "versions": versions}
-
-
 NOTES = """
 Mean over seeds ± standard deviation over seeds. "sd" is a standard deviation of the real data, column by column.
 
 - *Change*: root mean square difference, in sd, to the recorded step of the same number in the source episode (only
   where a synthetic episode is as long as its source). *Seam jump*: mean jump where a generated span meets recorded
   steps, in sd of the states, root mean square over features, beside the mean size of a real step in the same units.
-- *Simulator*: of at most {steps} generated steps the simulator is put into s and given a; the error of s' (position and
-  velocity) in sd of a real one-step difference, of r in sd of real rewards: root mean square, which few steps that begin
-  in walls can rule, and the median step's own. *Real steps*: the same of recorded steps, the check that this is right.
+- *Simulator*: of at most {steps} generated steps the simulator is put into s and given a; the error of s' (position
+  and velocity) in sd of a real one-step difference, of r in sd of real rewards: root mean square, which few steps that
+  begin in walls can rule, and the median step's own. *Real steps*: the same of recorded steps, which checks all this.
+  Without these columns: the environment cannot be put into the state of an observation alone (Adroit's holds no
+  velocities of the hand's joints), so that the held-out model alone judges.
 - *Held-out model*: error of s' - s, and of r, against regression trees fitted to the other half of the episodes, over
   that of real steps in the same place (`oat_gym.metrics.fidelity`); 1: as predictable as real steps.
-- *Nearness*: of {states} recorded states s and each target policy's mean action, the median distance in z-scored (s, a)
-  from (s, pi(s)) to the nearest step that is neither of s's episode nor made from it. Ratio 1: augmentation brings
-  nothing nearer. *(s, a)*: the same for recorded actions. A discrete action must be the same. Any more points are nearer
-  points: compare with jittering. At most {points} real and as many generated steps are searched.
+- *Nearness*: of {states} recorded states s and each target policy's mean action, the median distance in z-scored
+  (s, a) from (s, pi(s)) to the nearest step that is neither of s's episode nor made from it; *(s, a)* is the same for
+  recorded actions, and a discrete action must be the same. Ratio 1: nothing comes nearer. Any more points are nearer
+  points (compare with jittering), and what mixes episodes (SPAWNER, DGW) or learned from s's own is flattered. At most
+  {points} real and as many generated steps are searched.
 """
-NO_RESET = (
-    "The environment cannot be put into the state of an observation alone (Adroit's holds no velocities of the hand's "
-    "joints; simulated patients and students have more to them than is observed, real ones cannot be asked), so that "
-    "the held-out model alone judges the steps."
-)
 
 
-def tables(out: Path, limits: Limits) -> None:
+def tables(out: Path) -> None:
     """Write the markdown tables of the rows that are there."""
+    order = {name: number for number, name in enumerate(VARIANTS)}
     rows = list(read_rows(out / "steps.csv").values())
+    rows.sort(key=lambda row: (order[row["variant"].partition("+")[0]], row["variant"], int(row["seed"])))
     if not rows:
         raise SystemExit(f"{out} holds no rows: run first.")
-    datasets = list(dict.fromkeys(row["dataset"] for row in rows))
-    seeds = ", ".join(sorted({row["seed"] for row in rows}, key=int))
-    commits, versions = (", ".join(sorted({row[key] for row in rows} - {""})) for key in ("commit", "versions"))
-    names = ",".join(_variants(rows))
-    command = f"run --out FOLDER --datasets {','.join(datasets)} --variants {names} --seeds {seeds.replace(' ', '')}"
+    found = {key: ",".join(dict.fromkeys(row[key] for row in rows)) for key in (*KEYS, "commit", "versions")}
+    command = f"run --out FOLDER --datasets {found['dataset']} --variants {found['variant']} --seeds {found['seed']}"
     lines = ["# Generated steps", "", f"`python tests/benchmarks/diagnose_steps.py {command}`", ""]
-    lines += [f"Seeds {seeds}; commit {commits or 'unknown'}; {versions}; CPU."]
-    lines += [NOTES.format(**vars(limits))]
-    for dataset in datasets:
+    lines += [f"Seeds {found['seed']}; commit {found['commit'] or 'unknown'}; {found['versions']}; CPU."]
+    lines += [NOTES.format(**{key: " or ".join(sorted({row[key] for row in rows})) for key in vars(Limits())})]
+    for dataset in found["dataset"].split(","):
         lines += [f"## {dataset}", "", *_dataset([row for row in rows if row["dataset"] == dataset])]
-        lines += [] if dataset in SIMULATORS else [NO_RESET, ""]
     write_atomically(out / "steps.md", "\n".join(lines).encode())
-
-
-def _variants(rows: list[Row]) -> list[str]:
-    order = list(VARIANTS)
-    return sorted({row["variant"] for row in rows}, key=lambda name: (order.index(name.partition("+")[0]), name))
 
 
 def _dataset(rows: list[Row]) -> list[str]:
     lines: list[str] = []
     for title, columns in TABLES.items():
         shown = {column: heading for column, heading in columns.items() if any(row[column] for row in rows)}
-        if not shown:
-            continue
-        lines += [f"**{title}**", "", "| variant | seeds | " + " | ".join(shown.values()) + " |"]
-        lines += ["|---|" + "---|" * (1 + len(shown))]
-        for variant in _variants(rows):
+        if shown:
+            lines += [f"**{title}**", "", "| variant | seeds | " + " | ".join(shown.values()) + " |"]
+            lines += ["|---|" + "---|" * (1 + len(shown))]
+        for variant in dict.fromkeys(row["variant"] for row in rows if shown):
             mine = [row for row in rows if row["variant"] == variant]
-            count = sum(not row["reason"] for row in mine)
-            lines += [f"| {variant} | {count} | " + " | ".join(_cell(mine, column) for column in shown) + " |"]
-        lines += [""]
-    failures = {f"{row['variant']}, seed {row['seed']}: {row['reason']}" for row in rows if row["reason"]}
-    return lines + [f"- {failure}" for failure in sorted(failures)] + ([""] if failures else [])
+            cells = [variant, str(sum(not row["reason"] for row in mine)), *(_cell(mine, column) for column in shown)]
+            lines += ["| " + " | ".join(cells) + " |"]
+        lines += [""] if shown else []
+    failures = [f"- {row['variant']}, seed {row['seed']}: {row['reason']}" for row in rows if row["reason"]]
+    return [*lines, *failures, *([""] if failures else [])]
 
 
 def _cell(rows: list[Row], column: str) -> str:
@@ -423,13 +388,11 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=Limits.steps, help="most steps for simulator and model")
     parser.add_argument("--states", type=int, default=Limits.states, help="recorded states for the nearness")
     arguments = parser.parse_args()
-    limits = Limits(arguments.steps, arguments.states)
     if arguments.what == "tables":
-        return tables(arguments.out, limits)
+        return tables(arguments.out)
     variants = [find_variant(name) for name in arguments.variants.split(",")]
-    return run(
-        arguments.out, arguments.datasets.split(","), variants, list(map(int, arguments.seeds.split(","))), limits
-    )
+    seeds = [int(seed) for seed in arguments.seeds.split(",")]
+    return run(arguments.out, arguments.datasets.split(","), variants, seeds, Limits(arguments.steps, arguments.states))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,119 @@
+"""What is known of the numbers of `diagnose_steps.py` before they are computed, and that the script goes on."""
+
+import csv
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from minari import MinariDataset
+
+from oat_gym import Jittering, domains
+from oat_gym.metrics.steps import Scale, Steps
+from oat_gym.ope import PolicySet
+from oat_gym.spaces import FlatSpace
+
+SCRIPT = Path(__file__).with_name("diagnose_steps.py")
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("diagnose_steps", SCRIPT)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def found(script: ModuleType) -> dict[float, dict[str, float]]:
+    """The numbers of jittering by its sigma, on some episodes of the maze."""
+    whole, policies = domains.load("maze2d-umaze"), domains.policies("maze2d-umaze")
+    subject = script.Subject(
+        MinariDataset(whole.storage, episode_indices=whole.episode_indices[:12]),
+        PolicySet.of({name: policies[name] for name in ("umaze-0", "umaze-10")}),
+        script.SIMULATORS["maze2d-umaze"],
+        limits=script.Limits(steps=200, states=50),
+    )
+    return {sigma: script.diagnose(subject, Jittering(sigma=sigma), factor=3) for sigma in (0.0, 0.05)}
+
+
+def test_the_simulator_repeats_real_steps(found: dict[float, dict[str, float]]) -> None:
+    assert found[0.0]["check_state"] < 1e-6
+    assert found[0.0]["check_reward"] == 0
+
+
+def test_copies_change_nothing_and_bring_nothing_nearer(found: dict[float, dict[str, float]]) -> None:
+    copies = found[0.0]
+    assert copies["share_generated"] == 1
+    assert copies["change"] == copies["simulator_reward"] == copies["simulator_in_wall"] == 0
+    assert copies["simulator_state"] < 1e-6
+    assert copies["near_ratio"] == pytest.approx(1, abs=1e-9)
+
+
+def test_noise_of_a_known_size_is_found(found: dict[float, dict[str, float]]) -> None:
+    noisy = found[0.05]
+    assert noisy["change_state"] == pytest.approx(0.05, rel=0.05)
+    assert noisy["change_reward"] == pytest.approx(0.05, rel=0.1)
+    assert 0.03 < noisy["change_action"] < 0.05  # forces at their bounds stay inside them
+    assert noisy["near_ratio"] < 1
+    assert noisy["seam"] is None
+
+
+def test_the_simulator_sees_an_error_in_its_size(script: ModuleType, found: dict[float, dict[str, float]]) -> None:
+    steps = Steps(
+        states=np.array([[-1.0, 1.0, 1.0, 1.0, -1.0, 1.0, 0.5, 0.0]]),
+        actions=np.zeros((1, 2)),
+        rewards=np.ones(1),
+        next_states=np.zeros((1, 8)),
+        episodes=np.zeros(1, dtype=np.int64),
+        numbers=np.zeros(1, dtype=np.int64),
+    )
+    unit = (np.zeros(1), np.ones(1))
+    scale = Scale(states=unit, actions=unit, rewards=unit, changes=(np.zeros(8), np.full(8, 0.5)))
+    true, reward, in_wall = script.SIMULATORS["maze2d-umaze"](steps.states, steps.actions)
+    assert true[0, 0] > -1 and reward[0] == 0 and not in_wall[0]
+    off = Steps(**vars(steps) | {"next_states": np.hstack((np.zeros((1, 4)), true + 1.0))})
+    errors = script.simulator_errors(script.SIMULATORS["maze2d-umaze"], off, scale, "x")
+    assert errors["x_state"] == errors["x_state_median"] == pytest.approx(2.0)
+    assert errors["x_reward"] == 1
+
+
+def test_a_discrete_action_must_be_the_same(script: ModuleType) -> None:
+    states = np.array([[0.0], [1.0], [3.0]])
+    points = Steps(
+        states=states,
+        actions=np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
+        rewards=np.zeros(3),
+        next_states=states,
+        episodes=np.array([0, 1, 2]),
+        numbers=np.zeros(3, dtype=np.int64),
+    )
+    flat = FlatSpace.of(spaces.Discrete(2))
+    scale = Scale.of(points, observations=FlatSpace.of(spaces.Box(-9, 9, (1,))), actions=flat)
+    second = np.array([[[0.0, 1.0]]])  # only the third step, three metres away, took it
+    targets = script.Targets(points.take(np.array([0])), second, np.ones(2, dtype=bool))
+    assert targets.distance(points, scale) == pytest.approx(3 / states.std(), rel=1e-6)
+
+
+def test_rows_that_are_there_are_not_computed_again(tmp_path: Path) -> None:
+    cell = ("--datasets", "maze2d-umaze", "--variants", "jittering", "--seeds", "0", "--steps", "60", "--states", "5")
+
+    def call(what: str) -> str:
+        command = [sys.executable, str(SCRIPT), what, "--out", str(tmp_path), *cell]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert call("run").startswith("maze2d-umaze jittering 0")
+    assert call("run") == ""
+    call("tables")
+    (row,) = csv.DictReader((tmp_path / "steps.csv").read_text().splitlines())
+    assert float(row["change"]) == pytest.approx(0.03, rel=0.1)
+    text = (tmp_path / "steps.md").read_text()
+    assert "| jittering | 1 |" in text and "{" not in text
