@@ -260,8 +260,14 @@ def _method(variant: str) -> str:
 def _notes(analysis: Analysis, datasets: dict[str, str | None]) -> str:
     """Return what a caption must say: setting, seeds, budget, signs, stand-ins."""
     there = [name for name in datasets.values() if name is not None]
-    seeds = {cell.seed for cell in analysis.results.cells if cell.dataset in there and not cell.failed}
-    text = f"{len(seeds)} seeds, mean ± standard deviation; {analysis.results.setting.describe()}; "
+    seeds: dict[str, set[int]] = {}
+    for cell in analysis.results.cells:
+        if cell.dataset in there and not cell.failed:
+            seeds.setdefault(cell.variant, set()).add(cell.seed)
+    most = max((len(part) for part in seeds.values()), default=0)
+    fewer = ", ".join(f"{len(part)} for {name}" for name, part in seeds.items() if len(part) < most)
+    text = f"{most} seeds{f' ({fewer})' if fewer else ''}, mean ± standard deviation; "
+    text += f"{analysis.results.setting.describe()}; "
     text += (
         "; ".join(budget_lines(analysis.results))
         + ". + or - : better or worse than no augmentation, 95% interval excludes zero."

@@ -17,7 +17,7 @@ from oat_gym.benchmark.results import Results, Setting, cell_rows, estimate_rows
 from oat_gym.benchmark.scores import METRICS
 from oat_gym.benchmark.store import CellResult, read_result, write_result
 from oat_gym.benchmark.story import best_sentences, groups_of, sentence
-from oat_gym.benchmark.tables import all_tables, paper_table, write_tables
+from oat_gym.benchmark.tables import all_tables, dataset_table, paper_table, write_tables
 from oat_gym.errors import CacheError, ConfigurationError
 
 POLICIES = tuple(f"p{number}" for number in range(7))
@@ -92,6 +92,11 @@ def test_a_family_that_failed_on_one_side_is_left_out_of_the_mean_of_both() -> N
         "adroit-door-human", "scaling", "mean", "mae"
     )
     assert found.families == ("FQE",)
+    few = tuple(c for c in whole.cells if c.variant != "scaling" or c.seed == 0)
+    assert (
+        "3 seeds (1 for scaling)"
+        in dataset_table(Analysis(Results(whole.setting, few, whole.manifests, ())), "adroit-door-human").caption
+    )
     partial = Analysis(Results(whole.setting, kept, whole.manifests, ()))
     (group, _), *_ = groups_of(partial)
     told = {line.split()[0]: line for line in best_sentences(partial, group) if "error" in line}
