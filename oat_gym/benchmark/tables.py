@@ -57,6 +57,7 @@ def all_tables(analysis: Analysis) -> tuple[Table, ...]:
     made.append(table_2(analysis))
     made += [paper_table(analysis, level, metric) for level in paper.LEVELS for metric in METRICS]
     made += [dataset_table(analysis, dataset) for dataset in analysis.with_truth()]
+    made += [help_table(analysis, dataset, metric) for dataset in analysis.with_truth() for metric in METRICS]
     made.append(improvement_table(analysis))
     return tuple(table for table in made if table is not None)
 
@@ -128,6 +129,34 @@ def dataset_table(analysis: Analysis, dataset: str) -> Table:
     ]
     caption = f"All metrics of {dataset}. {_notes(analysis, {dataset: dataset})}"
     return Table(f"dataset-{dataset}", caption, ("estimator", "variant", *METRICS.values()), tuple(rows))
+
+
+def help_table(analysis: Analysis, dataset: str, metric: Metric) -> Table | None:
+    """Return whether each variant helped each estimator, and their mean: the improvement, its interval, the verdict."""
+    columns = (MEAN, *analysis.results.families)
+    rows: list[tuple[str, ...]] = []
+    for variant in analysis.results.variants:
+        found = [None if variant == NONE else analysis.finding(dataset, variant, name, metric) for name in columns]
+        if any(each is not None for each in found):
+            seeds = max(each.improvement.n_seeds for each in found if each is not None)
+            rows.append((variant, str(seeds), *(_verdict_text(each) for each in found)))
+    if not rows:
+        return None
+    unit = "percent less error" if metric == "mae" else "in its own unit"
+    caption = (
+        f"Did it help on {dataset}? Improvement of the {METRICS[metric]} over no augmentation ({unit}, positive is "
+        f"better), 95% interval and verdict. {_notes(analysis, {dataset: dataset})}"
+    )
+    return Table(f"helped-{metric}-{dataset}", caption, ("variant", "seeds", *columns), tuple(rows))
+
+
+def _verdict_text(found: Finding | None) -> str:
+    if found is None or not math.isfinite(found.improvement.value):
+        return "-"
+    change = found.improvement
+    numbers = [format_number(number) for number in (change.value, change.low, change.high)]
+    word = f" {change.verdict}" if change.verdict in ("helps", "hurts") else ""
+    return f"{numbers[0]} ({numbers[1]} to {numbers[2]}){word}"
 
 
 def improvement_table(analysis: Analysis) -> Table | None:

@@ -140,6 +140,12 @@ def test_all_tables_are_written_and_hold_what_they_say(analysis: Analysis, tmp_p
     names = {table.name for table in tables}
     assert {"table-02", "table-03", "table-04", "improvements", "dataset-adroit-door-human"} <= names
     assert "table-01-adroit-door-human" in names  # one of the policies is called expert
+    helped = next(table for table in tables if table.name == "helped-mae-adroit-door-human")
+    cells = {row[0]: dict(zip(helped.header, row, strict=True)) for row in helped.rows}
+    assert set(cells) == {"oat-paper", "jittering", "scaling"}
+    assert cells["oat-paper"]["FQE"].endswith(") helps") and cells["scaling"]["mean"].endswith(") hurts")
+    assert float(cells["oat-paper"]["FQE"].split()[0]) == pytest.approx(60, abs=2)
+    assert cells["jittering"]["seeds"] == "3" and cells["jittering"]["mean"].endswith(")")
     for table in tables:
         assert all(len(row) == len(table.header) for row in table.rows)
         assert "3 seeds" in table.caption or table.name.startswith(("improvements", "table-01"))
