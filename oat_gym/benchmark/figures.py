@@ -75,7 +75,10 @@ def _draw_bars(axes: Axes, panel: Panel) -> None:
         axes.plot(change.value, y, "|", color=COLORS[change.verdict], markersize=9)  # a bar of no length is seen too
         if change.n_seeds > 1 and math.isfinite(change.low):
             axes.plot([change.low, change.high], [y, y], color="black", linewidth=1.0)
-    _limit(axes, [change for change in panel.improvements if change is not None])
+    _limit(axes, [change for change in panel.improvements if change is not None], marks=panel.paper)
+    for y, change in zip(places, panel.improvements, strict=True):
+        if change is not None and change.n_seeds > 1:
+            _mark_cut(axes, change, y)
     for y, number in zip(places, panel.paper, strict=False):
         if math.isfinite(number):
             axes.plot(number, y, "D", color="white", markeredgecolor="black", markersize=4, clip_on=True)
@@ -88,7 +91,15 @@ def _draw_bars(axes: Axes, panel: Panel) -> None:
     axes.set_ylim(-0.6, len(panel.names) - 0.4)
 
 
-def _limit(axes: Axes, changes: Sequence[Improvement]) -> None:
+def _mark_cut(axes: Axes, change: Improvement, y: float) -> None:
+    """Draw an arrowhead where an interval leaves the picture."""
+    left, right = axes.get_xlim()
+    for outside, edge, marker in ((change.low < left, left, "<"), (change.high > right, right, ">")):
+        if outside:
+            axes.plot(edge, y, marker, color="black", markersize=4, clip_on=False)
+
+
+def _limit(axes: Axes, changes: Sequence[Improvement], *, marks: Sequence[float] = ()) -> None:
     """Keep one interval that is far wider than the values from hiding all others; it then leaves the picture."""
     values = np.array([abs(change.value) for change in changes if math.isfinite(change.value)])
     ends = np.array([e for change in changes for e in (change.low, change.high) if math.isfinite(e)])
@@ -96,10 +107,11 @@ def _limit(axes: Axes, changes: Sequence[Improvement]) -> None:
     if not len(values):
         axes.set_xlim(-1, 1)
         return
-    reach = max(3.0 * float(np.quantile(values, 0.75)), 1.15 * float(values.max()))
+    shown = np.array([number for number in marks if math.isfinite(number)])
+    reach = max(3.0 * float(np.quantile(values, 0.75)), 1.15 * float(np.abs([*values, *shown]).max()))
     reach = reach if reach > 1e-6 else max(float(np.abs(ends).max(initial=0.0)), 0.1)
-    low = max(float(min(ends.min(initial=0.0), -values.max() * 0.05)), -reach)
-    high = min(float(max(ends.max(initial=0.0), values.max() * 0.05)), reach)
+    low = max(float(min(ends.min(initial=0.0), shown.min(initial=0.0), -values.max() * 0.05)), -reach)
+    high = min(float(max(ends.max(initial=0.0), shown.max(initial=0.0), values.max() * 0.05)), reach)
     axes.set_xlim(1.05 * low - 1e-3 * reach, 1.05 * high + 1e-3 * reach)
 
 

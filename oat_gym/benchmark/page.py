@@ -34,7 +34,7 @@ def write_page(folder: Path, path: Path, *, pictures: Path | None = None) -> Pat
     write_atomically(path, _render(settings).encode())
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
-        for number, picture in enumerate(_pictures(settings)):
+        for number, picture in enumerate(dict.fromkeys(_pictures(settings))):
             name = re.sub(r"[^a-z0-9]+", "-", picture.alt.lower())[:60].strip("-")
             write_atomically(pictures / f"{number:02d}-{name}.png", base64.b64decode(picture.data))
     return path

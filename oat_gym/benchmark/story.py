@@ -95,8 +95,9 @@ def sentence(found: Finding, *, of: str, part: str = "") -> str:
 def summary_rows(analysis: Analysis, group: Group) -> list[dict[str, Any]]:
     """Return, for each variant, its verdict by each metric, averaged over the estimators and the group's datasets."""
     rows: list[dict[str, Any]] = []
+    measured = {cell.variant for cell in analysis.results.cells if cell.dataset in group[1]}
     for variant in analysis.results.variants:
-        if variant == NONE:
+        if variant == NONE or variant not in measured:
             continue
         found = {metric: analysis.over(group[1], variant, MEAN, metric) for metric in METRICS}
         part = next((part_of(each, analysis, group) for each in found.values() if each is not None), "")
@@ -143,7 +144,8 @@ def bars(analysis: Analysis, group: Group, *, family: str = MEAN, level: str | N
 
     `level` names the level of the paper's tables whose numbers are marked.
     """
-    names = [variant for variant in analysis.results.variants if variant != NONE]
+    measured = {cell.variant for cell in analysis.results.cells if cell.dataset in group[1]}
+    names = [variant for variant in analysis.results.variants if variant != NONE and variant in measured]
     panels: list[Panel] = []
     for metric, title in METRICS.items():
         found = [analysis.over(group[1], variant, family, metric) for variant in names]
