@@ -41,9 +41,9 @@ class ModelBased(Estimator):
     """Returns of each policy in learned models of the process, from the initial states.
 
     The models do not depend on the policies: they are fitted once for all, the members and seeds in one computation,
-    and keep the weights of the least error on held-out real episodes. States and rewards of roll-outs are clipped to
-    the range of the training data. Where episodes terminate, the probability of going on is learned, and a roll-out
-    counts for that fraction from then on. Truncations are no ends.
+    and keep the weights of the least error on held-out episodes (real ones and what was made from them). States and
+    rewards of roll-outs are clipped to the range of the training data. Where episodes terminate, the probability of
+    going on is learned, and a roll-out counts for that fraction from then on. Truncations are no ends.
 
     Forms (`kind`):
 
@@ -80,7 +80,7 @@ class ModelBased(Estimator):
         ensemble: members; the estimate is their mean.
         bootstrap: see Intervals.
         rollouts: for each member, policy and initial state.
-        held_out: share of the real episodes that decides when training was best.
+        held_out: share of the real episodes that, with what was made from them, decides when training was best.
         max_steps: of a roll-out without a horizon.
         tolerance: see above.
         max_starts: with more initial states, as many as this are drawn.
