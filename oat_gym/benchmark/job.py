@@ -143,7 +143,7 @@ def _evaluate(desk: _Desk, places: Catalog) -> None:
         seeds=(job.seed,),
         behavior=job.budget.cloning if job.question.behavior == "clone" else "logged",
         initial_states=job.question.starts(task),
-        use_augmented=job.variant.use_augmented,
+        use_augmented=_by_name(job.variant.use_augmented, estimators),
         resamples=job.question.resamples,
         device=job.device,
         progress=False,
@@ -156,6 +156,14 @@ def _load(places: Catalog, job: Job) -> tuple[MinariDataset, list[str]]:
         warnings.simplefilter("always")
         real = places.load(job.dataset, episodes=job.budget.episodes)
     return real, [str(warning.message) for warning in caught if issubclass(warning.category, RewardWarning)]
+
+
+def _by_name(use: ope.UseAugmented, estimators: list[Measured]) -> ope.UseAugmented:
+    """Return a use that names families (which a measured estimator hides) as one that names estimators."""
+    if not isinstance(use, Mapping):
+        return use
+    names = {each.name: next((n for n in (each.name, each.inner.family) if n in use), None) for each in estimators}
+    return {name: ("training",) if found is None else use[found] for name, found in names.items()}
 
 
 def _curves(

@@ -95,15 +95,18 @@ def sentence(found: Finding, *, of: str, part: str = "") -> str:
 def summary_rows(analysis: Analysis, group: Group) -> list[dict[str, Any]]:
     """Return, for each variant, its verdict by each metric, averaged over the estimators and the group's datasets."""
     rows: list[dict[str, Any]] = []
-    measured = {cell.variant for cell in analysis.results.cells if cell.dataset in group[1]}
-    for variant in analysis.results.variants:
-        if variant == NONE or variant not in measured:
-            continue
+    for variant in _measured(analysis, group):
         found = {metric: analysis.over(group[1], variant, MEAN, metric) for metric in METRICS}
         part = next((part_of(each, analysis, group) for each in found.values() if each is not None), "")
         text = f"{note(variant)} ({part})" if part else note(variant)
         rows.append({"variant": variant, "note": text, "cells": [_verdict(each) for each in found.values()]})
     return rows
+
+
+def _measured(analysis: Analysis, group: Group) -> list[str]:
+    """Return the variants that have cells of a group's datasets, in the order of the runs."""
+    there = {cell.variant for cell in analysis.results.cells if cell.dataset in group[1]} - {NONE}
+    return [variant for variant in analysis.results.variants if variant in there]
 
 
 def note(variant: str) -> str:
@@ -129,8 +132,7 @@ def best_sentences(analysis: Analysis, group: Group) -> list[str]:
     """Return the findings for errors and ranks of every variant, in words, the best first."""
     found = [
         each
-        for variant in analysis.results.variants
-        if variant != NONE
+        for variant in _measured(analysis, group)
         for metric in ("mae", "rank_correlation")
         if (each := analysis.over(group[1], variant, MEAN, metric)) is not None
     ]
@@ -144,8 +146,7 @@ def bars(analysis: Analysis, group: Group, *, family: str = MEAN, level: str | N
 
     `level` names the level of the paper's tables whose numbers are marked.
     """
-    measured = {cell.variant for cell in analysis.results.cells if cell.dataset in group[1]}
-    names = [variant for variant in analysis.results.variants if variant != NONE and variant in measured]
+    names = _measured(analysis, group)
     panels: list[Panel] = []
     for metric, title in METRICS.items():
         found = [analysis.over(group[1], variant, family, metric) for variant in names]

@@ -204,8 +204,6 @@ def parse_variants(names: str) -> tuple[Variant, ...]:
 
 def quick_augmenter(augmenter: Augmenter) -> Augmenter:
     """Return the same method trained for a moment: at most 60 updates, ten clusters and no search for their number."""
-    if isinstance(augmenter, Compose):
-        return Compose(tuple(quick_augmenter(part) for part in augmenter.augmenters))
     if isinstance(augmenter, TimeGAN):
         small = replace(augmenter.model, embedding_iterations=20, supervised_iterations=10, joint_iterations=10)
         return replace(augmenter, model=small)
@@ -214,8 +212,6 @@ def quick_augmenter(augmenter: Augmenter) -> Augmenter:
 
 def on_device(augmenter: Augmenter, device: str) -> Augmenter:
     """Return the same method with every network on a torch device."""
-    if isinstance(augmenter, Compose):
-        return Compose(tuple(on_device(part, device) for part in augmenter.augmenters))
 
     def moved(part: Any) -> Any:
         if isinstance(part, VAEMDPConfig | VAEConfig | BehaviorConfig | TimeGANConfig):
@@ -258,6 +254,8 @@ def _quick_part(part: Any) -> Any:
 
 
 def _replace_fields(augmenter: Augmenter, change: Callable[[Any], Any]) -> Augmenter:
+    if isinstance(augmenter, Compose):
+        return Compose(tuple(_replace_fields(part, change) for part in augmenter.augmenters))
     parts = {field.name: getattr(augmenter, field.name) for field in fields(augmenter) if field.init}
     changed = {name: change(part) for name, part in parts.items()}
     return replace(augmenter, **{name: part for name, part in changed.items() if part is not parts[name]})

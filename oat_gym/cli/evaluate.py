@@ -82,12 +82,19 @@ def evaluate(
             paired=isinstance(data, AugmentedDataset) and use_augmented != "none",
             progress=progress,
         )
+    _tell(result, known, file, elsewhere=starts is None and task is not None and task.initial_states is not None)
+
+
+def _tell(
+    result: ope.Result, known: dict[str, float] | domains.Truth | None, file: Path | None, *, elsewhere: bool
+) -> None:
+    """Print estimates and errors, and write the file; `elsewhere`: true values count from other states."""
     _print_estimates(result)
     if file is not None:
         write_atomically(file, to_csv(result.rows).encode())
         out.print(f"Every estimate: {file}")
     if known is not None:
-        if starts is None and task and task.initial_states:
+        if elsewhere:
             out.print("True values count from the environment's resets, estimates from the data's first states.")
         _print_errors(result, known)
 

@@ -244,6 +244,21 @@ def test_variants_keep_their_form_on_other_devices_and_budgets() -> None:
     assert quick_augmenter(both).augmenters[0].model.max_updates == 60
 
 
+def test_a_variant_may_use_synthetic_episodes_for_some_families_only(tmp_path: Path) -> None:
+    variants = [
+        VARIANTS["none"],
+        VARIANTS["jittering"],
+        dataclasses.replace(VARIANTS["jittering"], name="but-fqe", use_augmented={"FQE": "none", "IS": "all"}),
+    ]
+    plan = make_plan(tiny.SUITE, variants, seeds=(0,), question=QUESTION, budget=tiny.BUDGET, catalog=tiny.CATALOG)
+    run(plan, tmp_path, catalog=tiny.CATALOG)
+    results = [read_result(cell_path(tmp_path, cell)) for job in plan.jobs for cell in job.cells()]
+    values = {(result.variant, result.family): result.values for result in results}
+    np.testing.assert_array_equal(values["but-fqe", "FQE"], values["none", "FQE"])
+    np.testing.assert_array_equal(values["but-fqe", "IS"], values["jittering", "IS"])
+    assert (values["but-fqe", "IS"] != values["none", "IS"]).all()
+
+
 def test_target_policies_act_in_roll_outs_where_a_variant_says_so(tmp_path: Path) -> None:
     variant = find_variant("oat-targets")
     assert VARIANTS["oat"].with_policies(tiny.policies()) is VARIANTS["oat"].augmenter
