@@ -10,12 +10,13 @@ import numpy as np
 import numpy.typing as npt
 from minari import MinariDataset
 
-from oat_gym._rng import check_seed, derive
+from oat_gym._rng import check_seed
 from oat_gym.augmenters.generative import Learned, Matrices, check_kind, learn, with_prefix
 from oat_gym.augmenters.stitched import StitchedSampler, StitchingAugmenter, Windows, check_length
 from oat_gym.cache import Arrays
 from oat_gym.errors import ConfigurationError, InvalidDataError
-from oat_gym.mining import MiningConfig, MiningResult, mine
+from oat_gym.mining import MiningConfig, MiningResult
+from oat_gym.mining.kept import mine_once
 from oat_gym.mining.state import mining_from_state, mining_to_state
 from oat_gym.progress import ProgressCallback, silent
 from oat_gym.source import Source
@@ -97,7 +98,7 @@ class OAT(StitchingAugmenter):
     def _mine(self, source: Source, *, seed: int, progress: ProgressCallback) -> MiningResult:
         columns, times = _feature_columns(self, source), _times(self, source)
         series = [rows[:-1][:, columns] for rows in source.state_matrices()]
-        return mine(series, config=self.mining, times=times, rng=derive(seed, "mining"), progress=progress)
+        return mine_once(series, config=self.mining, times=times, seed=seed, progress=progress)
 
     def restore(self, source: Source, arrays: Arrays, value: Any, *, seed: int) -> OATSampler:
         """Return the sampler that `OATSampler.state` described; warns of episodes that it can only copy."""
