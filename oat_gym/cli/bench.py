@@ -72,7 +72,7 @@ def bench(
         reports = run(plan, folder, n_jobs=jobs, scheduler=scheduler, listen=listen)
     _tell_failures(reports)
     for results in read_results(folder):
-        _finish(results, folder)
+        _finish(results, folder, plan.suite.datasets)
     out.print(f"A page to read: oat-gym report {folder}")
 
 
@@ -201,8 +201,8 @@ def _tell_failures(reports: list[JobReport]) -> None:
         out.print(f"{count} cells failed: {reason}", markup=False)
 
 
-def _finish(results: Results, folder: Path) -> None:
-    """Write tables and tidy files of a setting, and print what was found."""
+def _finish(results: Results, folder: Path, asked: tuple[str, ...]) -> None:
+    """Write tables and tidy files of a setting, and print what was found on the datasets of this run."""
     setting = results.setting
     where = folder / "tables" / setting.slug
     analysis = Analysis(results)
@@ -211,7 +211,9 @@ def _finish(results: Results, folder: Path) -> None:
     write_tidy(results, where)
     write_tables(all_tables(analysis), where)
     for group, _ in groups_of(analysis):
-        out.print(f"{group[0]}, averages over {', '.join(results.families)}, {setting.describe()}:", markup=False)
-        for line in best_sentences(analysis, group):
+        lines = best_sentences(analysis, group) if set(group[1]) & set(asked) else []
+        if lines:
+            out.print(f"{group[0]}, averages over {', '.join(results.families)}, {setting.describe()}:", markup=False)
+        for line in lines:
             out.print(f"  {line}")
     out.print(f"Tables: {where}")

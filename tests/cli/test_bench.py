@@ -80,6 +80,19 @@ def test_some_datasets_of_a_suite(tmp_path: Path) -> None:
     assert done.exit_code == 0
     assert "line-human" not in done.output
     assert "2 cells in 1 jobs" in done.output
+    assert "averages over" not in done.output  # nothing was compared
+
+
+@pytest.mark.usefixtures("tiny_suite")
+def test_a_run_tells_what_it_found_and_not_what_an_earlier_one_did(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = ["--augmenters", "jittering", "--seeds", "1", "--out", str(tmp_path)]
+    CliRunner().invoke(cli.app, ["bench", "--suite", "line", "--datasets", "line", *where], catch_exceptions=False)
+    monkeypatch.setitem(protocol.SUITES, "logs", protocol.Suite("logs", ("line-logs",), "nobody knows the truth"))
+    done = CliRunner().invoke(cli.app, ["bench", "--suite", "logs", *where], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert "the error by" not in done.output
 
 
 def test_nothing_at_hand_and_nothing_to_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
