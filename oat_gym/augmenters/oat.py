@@ -42,6 +42,11 @@ class OAT(StitchingAugmenter):
         seam: "contiguous" (Minari's form), "literal" (the paper's: tuples outside the span keep their own next state,
             visible in `transitions()`), or "matched" (of `candidates` samples the one with the least seam jump).
         candidates: how many samples "matched" chooses from.
+        ends: whether a span may hold the step in which an episode terminates: "generated" (yes, as in the paper), or
+            "recorded" (no: an episode ends as it did, with its own last reward, since p(s|z) and p(r|z) know nothing of
+            terminations). Truncated episodes have no such step.
+        rewards: "modelled": as p(r|z) gives them, as in the paper, or "recorded": the nearest reward that the data
+            holds, so that rewards of a few values (0 but for the last step, stages) keep them.
         features: the keys of a Dict observation space that are mined; None takes the whole observation.
         times: the key of the infos that holds the time of each observation, for irregular data (MT-TICC); None: steps.
 
@@ -68,7 +73,7 @@ class OAT(StitchingAugmenter):
         _feature_columns(self, source)
         if isinstance(self.mining.length, int):
             advice = "Use OAT(mining=MiningConfig(length={half})) or length='auto'."
-            check_length(source, self.mining.length, advice=advice)
+            check_length(source.lengths, self.mining.length, advice=advice)
 
     def fit(self, source: Source, *, seed: int, progress: ProgressCallback = silent) -> OATSampler:
         """Mine, clone the behaviour policy, and train one VAE-MDP for each PST set."""
@@ -98,7 +103,8 @@ class OAT(StitchingAugmenter):
     def _mine(self, source: Source, *, seed: int, progress: ProgressCallback) -> MiningResult:
         columns, times = _feature_columns(self, source), _times(self, source)
         series = [rows[:-1][:, columns] for rows in source.state_matrices()]
-        return mine_once(series, config=self.mining, times=times, seed=seed, progress=progress)
+        usable = self.usable(source).tolist()
+        return mine_once(series, config=self.mining, times=times, usable=usable, seed=seed, progress=progress)
 
     def restore(self, source: Source, arrays: Arrays, value: Any, *, seed: int) -> OATSampler:
         """Return the sampler that `OATSampler.state` described; warns of episodes that it can only copy."""

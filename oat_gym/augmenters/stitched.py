@@ -32,7 +32,10 @@ from oat_gym.source import Source
 from oat_gym.spaces import Batch, map_tree
 from oat_gym.stitching import Seam, Span, literal_next_states, stitch_into, stitchable_copy
 
+FloatArray = npt.NDArray[np.float64]
 Actions = Literal["behavior", "recorded"]
+Ends = Literal["generated", "recorded"]
+Rewards = Literal["modelled", "recorded"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,12 +45,23 @@ class StitchingAugmenter(GenerativeAugmenter):
     actions: Actions = "behavior"
     seam: Seam = "contiguous"
     candidates: int = 16
+    ends: Ends = "generated"
+    rewards: Rewards = "modelled"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("actions", self.actions, get_args(Actions))
         check_choice("seam", self.seam, get_args(Seam))
         check_integer("candidates", self.candidates, at_least=1)
+        check_choice("ends", self.ends, get_args(Ends))
+        check_choice("rewards", self.rewards, get_args(Rewards))
+
+    def usable(self, source: Source) -> IntArray:
+        """Return how many steps of each episode, from the first, spans may cover, (N,)."""
+        if self.ends == "generated":
+            return source.lengths
+        terminated = [bool(episode.terminations[-1]) for episode in source.episodes]
+        return source.lengths - np.array(terminated, dtype=np.int64)
 
     @classmethod
     def preset(cls, preset: Literal["default", "paper"]) -> Self:
@@ -97,13 +111,12 @@ class Windows:
             )
 
 
-def check_length(source: Source, length: int, *, advice: str) -> None:
+def check_length(lengths: IntArray, length: int, *, advice: str) -> None:
     """Raise `InvalidDataError` unless some episode has `length` steps; `advice` may name `{half}` the median length."""
-    lengths = source.lengths
     if lengths.max() < length:
         median = np.median(lengths)
         raise InvalidDataError(
-            f"No episode is as long as a sub-trajectory of {length} steps: the {len(source)} episodes have "
+            f"No episode is as long as a sub-trajectory of {length} steps: the {len(lengths)} episodes have "
             f"{lengths.min()} to {lengths.max()} steps (median {median:g}). "
             + advice.format(half=max(1, int(median) // 2))
         )
@@ -169,6 +182,8 @@ class StitchedSampler(GenerativeSampler):
         jumps = seam_jumps(samples.states, recorded.repeat(repeats, axis=0), self._scale)
         best = jumps.sum(axis=1).reshape(len(rows), repeats).argmin(axis=1) + np.arange(len(rows)) * repeats
         drawn = {name: getattr(samples, name)[best] for name in ("states", "actions", "rewards", "log_prob")}
+        if config.rewards == "recorded":
+            drawn["rewards"] = nearest(drawn["rewards"], np.concatenate(data.rewards))
         return drawn | {"rows": np.array(rows), "seams": jumps[best]}
 
     def decode(self, arrays: Arrays) -> dict[int, SpanSamples]:
@@ -198,6 +213,16 @@ class StitchedSampler(GenerativeSampler):
                 last |= generated
         spans.sort(key=lambda span: span.start)
         return Variation(episode, tuple(spans), before | last, log_prob)
+
+
+def nearest(values: FloatArray, recorded: FloatArray) -> FloatArray:
+    """Return, for each of `values`, the nearest of the `recorded` (n,) numbers; of two as near the smaller.
+
+    >>> nearest(np.array([[-3.0, 0.4, 0.6]]), np.array([1.0, 0.0, 0.0])).tolist()
+    [[0.0, 0.0, 1.0]]
+    """
+    known = np.unique(recorded)
+    return known[np.searchsorted((known[1:] + known[:-1]) / 2, values)]
 
 
 def _with_room_for(recorded: npt.NDArray[Any], generated: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -15,6 +15,8 @@ from oat_gym.generation.config import check_integer
 from oat_gym.progress import ProgressCallback, silent
 from oat_gym.source import Source
 
+_ADVICE = "Use TDA(length={half})."
+
 
 @dataclass(frozen=True)
 class TDA(StitchingAugmenter):
@@ -30,7 +32,8 @@ class TDA(StitchingAugmenter):
 
     Args:
         length: W, the steps of a window.
-        model: see `OAT`, as `behavior`, `start`, `actions`, `policy`, `observation_noise`, `seam` and `candidates`.
+        model: see `OAT`, as `behavior`, `start`, `actions`, `policy`, `observation_noise`, `seam`, `candidates`, `ends`
+            and `rewards`.
 
     >>> TDA().length, TDA.preset("paper").seam
     (20, 'literal')
@@ -46,13 +49,15 @@ class TDA(StitchingAugmenter):
     def check(self, source: Source) -> None:
         """Raise where the spaces cannot be modelled or every episode is shorter than W."""
         super().check(source)
-        check_length(source, self.length, advice="Use TDA(length={half}).")
+        check_length(source.lengths, self.length, advice=_ADVICE)
 
     def windows(self, source: Source, *, seed: int) -> Windows:
-        """Return the window of each episode that has `length` steps, its first step uniform over 0 to T - W."""
+        """Return the window of each episode that has room for one, its first step uniform over all that it can be."""
+        usable = self.usable(source)
+        check_length(usable, self.length, advice=_ADVICE)
         rows = [
             (i, int(derive(seed, "window", i).integers(steps - self.length + 1)))
-            for i, steps in enumerate(source.lengths.tolist())
+            for i, steps in enumerate(usable.tolist())
             if steps >= self.length
         ]
         return Windows(self.length, (np.array(rows, dtype=np.int64),), ("the random windows",))

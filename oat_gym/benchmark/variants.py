@@ -159,6 +159,18 @@ VARIANTS: dict[str, Variant] = {
             note="as oat-matched, one synthetic episode for each real one: synthetic steps weigh half",
         ),
         Variant(
+            "oat-ends",
+            OAT(ends="recorded"),
+            use_augmented=None,
+            note="as oat, and episodes terminate as recorded: no span holds their last step",
+        ),
+        Variant(
+            "oat-kept",
+            OAT(start="posterior", seam="matched", observation_noise=False, ends="recorded", rewards="recorded"),
+            use_augmented=None,
+            note="as oat-smooth, with recorded terminations, and rewards that the data holds",
+        ),
+        Variant(
             "oat-jitter",
             Compose((OAT(start="posterior", seam="matched", observation_noise=False), Jittering())),
             use_augmented=None,

@@ -1,4 +1,4 @@
-"""Mining once: the result of a series is kept in the cache, for every method and setting that starts from it."""
+"""Labelling once: the labels of a set of series are kept in the cache, for every form of OAT that starts from them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,23 @@ import numpy.typing as npt
 
 from oat_gym._rng import derive
 from oat_gym.cache import CacheEntry, fingerprint
-from oat_gym.mining.pst import MiningConfig, MiningResult, mine
-from oat_gym.mining.state import mining_from_state, mining_to_state
+from oat_gym.mining.pst import MiningConfig, MiningResult, check_long_enough, find_windows, label, series_lengths
+from oat_gym.mining.state import labelling_from_state, labelling_to_state
 from oat_gym.progress import ProgressCallback, silent
 
 FloatArray = npt.NDArray[np.float64]
+LABELLING = (
+    "n_clusters",
+    "candidates",
+    "criterion",
+    "restarts",
+    "window",
+    "sparsity",
+    "switch_penalty",
+    "max_iterations",
+    "init",
+)
+"""The settings that labels depend on; the others of `MiningConfig` are of the windows."""
 
 
 def mine_once(
@@ -23,22 +35,29 @@ def mine_once(
     config: MiningConfig,
     seed: int,
     times: Sequence[FloatArray] | None = None,
+    usable: Sequence[int] | None = None,
     progress: ProgressCallback = silent,
 ) -> MiningResult:
-    """Return what `mine` finds, from the cache where the same series were mined with the same settings and seed.
+    """Return what `mine` finds, with the labels from the cache where the same series were labelled before.
 
-    Mining takes most of the time of fitting OAT, and its forms differ in what they do with the windows: how models are
-    trained, where roll-outs start, how seams are made. They share one result.
+    TICC takes most of the time of fitting OAT, and forms of OAT differ in the windows that they then look for and in
+    what they do with them. They share the labels.
+
+    Raises:
+        InvalidDataError: as `mine`.
     """
-    key = fingerprint(part="mining", config=config, seed=seed, series=_digest(series), times=_digest(times or ()))
-    entry = CacheEntry(key)
+    check_long_enough(series_lengths(series) if usable is None else usable, config)
+    settings = {name: getattr(config, name) for name in LABELLING}
+    entry = CacheEntry(
+        fingerprint(part="labels", config=settings, seed=seed, series=_digest(series), times=_digest(times or ()))
+    )
     with entry.lock():
-        stored = entry.read("mining")
+        stored = entry.read("labels")
         if stored is None:
-            rng = derive(seed, "mining")
-            stored = mining_to_state(mine(series, config=config, times=times, rng=rng, progress=progress))
-            entry.write("mining", *stored)
-    return mining_from_state(*stored)
+            found = label(series, config=config, rng=derive(seed, "mining"), times=times, progress=progress)
+            stored = labelling_to_state(found)
+            entry.write("labels", *stored)
+    return find_windows(labelling_from_state(*stored), config=config, usable=usable)
 
 
 def _digest(arrays: Sequence[FloatArray]) -> str:

@@ -193,6 +193,7 @@ def mine(
     config: MiningConfig,
     rng: np.random.Generator,
     times: Sequence[ArrayLike] | None = None,
+    usable: Sequence[int] | None = None,
     progress: Progress | None = None,
 ) -> MiningResult:
     """Label all rows with TICC, count the support of all windows, and select the sets of PSTs.
@@ -202,10 +203,11 @@ def mine(
         config: the settings.
         rng: the source of the initialisations' seed and of the silhouette's sample.
         times: list of (T_i,) times, for MT-TICC's time-aware switching penalty.
+        usable: how many rows of each series, from the first, windows may cover; None: all. All rows are labelled.
         progress: called as `progress(description, done, total)`.
 
     Raises:
-        InvalidDataError: series that `TICC.fit` refuses; no series as long as W.
+        InvalidDataError: series that `TICC.fit` refuses; no series with W usable rows.
         ConfigurationError: more clusters than rows.
 
     >>> rng = np.random.default_rng(0)
@@ -213,7 +215,32 @@ def mine(
     >>> mine(series, config=MiningConfig(n_clusters=2, length=40, switch_penalty=10.0), rng=rng).sets[0].support
     3
     """
-    check_long_enough(series, config)
+    check_long_enough(series_lengths(series) if usable is None else usable, config)
+    found = label(series, config=config, rng=rng, times=times, progress=progress)
+    return find_windows(found, config=config, usable=usable)
+
+
+@dataclass(frozen=True, eq=False)
+class Labelling:
+    """The label of every row: the part of mining that takes long, whatever the windows that are then looked for.
+
+    Attributes: see `MiningResult`.
+    """
+
+    labels: tuple[Ints, ...]
+    n_clusters: int
+    criterion_scores: dict[int, float]
+
+
+def label(
+    series: Sequence[ArrayLike],
+    *,
+    config: MiningConfig,
+    rng: np.random.Generator,
+    times: Sequence[ArrayLike] | None = None,
+    progress: Progress | None = None,
+) -> Labelling:
+    """Return the labels of all rows, the first step of `mine`."""
     model, scores = choose_clusters(
         series,
         candidates=config.candidates if config.n_clusters == "auto" else (config.n_clusters,),
@@ -223,17 +250,25 @@ def mine(
         times=times,
         progress=progress,
     )
-    labels = model.labels_
+    return Labelling(tuple(model.labels_), model.n_clusters, scores)
+
+
+def find_windows(found: Labelling, *, config: MiningConfig, usable: Sequence[int] | None = None) -> MiningResult:
+    """Count the support of all windows in the usable rows and select the sets of PSTs, the second step of `mine`."""
+    labels = found.labels
+    if usable is not None:
+        labels = tuple(rows[:count] for rows, count in zip(found.labels, usable, strict=True))
+        check_long_enough(usable, config)
     length = _window_length(labels, config)
     curve = support_curve(labels, aligned=config.aligned)
     table = count_tdss(labels, length, aligned=config.aligned)
     curve[length] = int(table.support.max())
     xi = config.threshold(len(labels))
     return MiningResult(
-        labels=tuple(labels),
-        n_clusters=model.n_clusters,
+        labels=found.labels,
+        n_clusters=found.n_clusters,
         criterion=config.criterion,
-        criterion_scores=scores,
+        criterion_scores=found.criterion_scores,
         length=length,
         supports=np.sort(table.support)[::-1].copy(),
         support_curve=dict(sorted(curve.items())),
@@ -258,14 +293,18 @@ def _window_length(labels: Sequence[Ints], config: MiningConfig) -> int:
     return length
 
 
-def check_long_enough(series: Sequence[ArrayLike], config: MiningConfig) -> None:
-    """Raise `InvalidDataError` if W is given and no series has so many rows."""
-    lengths = [len(np.atleast_1d(np.asarray(item))) for item in series]
-    if config.length == "auto" or not lengths or max(lengths) >= config.length:
+def series_lengths(series: Sequence[ArrayLike]) -> list[int]:
+    """Return the number of rows of each series."""
+    return [len(np.atleast_1d(np.asarray(item))) for item in series]
+
+
+def check_long_enough(lengths: Sequence[int], config: MiningConfig) -> None:
+    """Raise `InvalidDataError` if W is given and no series has so many usable rows."""
+    if config.length == "auto" or len(lengths) == 0 or max(lengths) >= config.length:
         return
     raise InvalidDataError(
         f"No series is as long as a PST: W={config.length}, but the series have {min(lengths)} to {max(lengths)} rows "
-        f'(median {np.median(lengths):g}). Use length="auto" or a length of at most {max(lengths)}.'
+        f'to find it in (median {np.median(lengths):g}). Use length="auto" or a length of at most {max(lengths)}.'
     )
 
 

@@ -1,4 +1,4 @@
-"""Mining is done once for each series, settings and seed, and what the cache holds is what was mined."""
+"""Labels are found once for each series, settings and seed, and what the cache holds is what was found."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from oat_gym import OAT, AugmentedDataset
+from oat_gym._rng import derive
 from oat_gym.cache import cache_folder
-from oat_gym.mining import MiningConfig, kept
+from oat_gym.errors import InvalidDataError
+from oat_gym.mining import MiningConfig, kept, mine
 from oat_gym.mining.kept import mine_once
 
 CONFIG = MiningConfig(n_clusters=3, length=10, switch_penalty=10.0)
@@ -24,19 +26,19 @@ def series() -> list[np.ndarray]:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """A list that grows by one each time something is mined."""
+    """A list that grows by one each time series are labelled."""
     made: list[str] = []
-    mine = kept.mine
+    label = kept.label
 
     def counted(*args: object, **settings: object) -> object:
-        made.append("mined")
-        return mine(*args, **settings)  # type: ignore[arg-type]
+        made.append("labelled")
+        return label(*args, **settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(kept, "mine", counted)
+    monkeypatch.setattr(kept, "label", counted)
     return made
 
 
-def test_the_same_question_is_mined_once(series: list[np.ndarray], calls: list[str]) -> None:
+def test_the_same_question_is_labelled_once(series: list[np.ndarray], calls: list[str]) -> None:
     first = mine_once(series, config=CONFIG, seed=0)
     again = mine_once([rows.copy() for rows in series], config=CONFIG, seed=0)
     assert len(calls) == 1
@@ -45,10 +47,10 @@ def test_the_same_question_is_mined_once(series: list[np.ndarray], calls: list[s
         np.testing.assert_array_equal(one, other)
 
 
-def test_another_question_is_mined_anew(series: list[np.ndarray], calls: list[str]) -> None:
+def test_another_question_is_labelled_anew(series: list[np.ndarray], calls: list[str]) -> None:
     mine_once(series, config=CONFIG, seed=0)
     mine_once(series, config=CONFIG, seed=1)
-    mine_once(series, config=replace(CONFIG, length=12), seed=0)
+    mine_once(series, config=replace(CONFIG, switch_penalty=5.0), seed=0)
     mine_once([*series[1:], series[0]], config=CONFIG, seed=0)
     mine_once(series, config=CONFIG, seed=0, times=[np.arange(len(rows), dtype=float) for rows in series])
     changed = [rows.copy() for rows in series]
@@ -57,9 +59,27 @@ def test_another_question_is_mined_anew(series: list[np.ndarray], calls: list[st
     assert len(calls) == 6
 
 
-def test_a_damaged_result_is_mined_again(series: list[np.ndarray], calls: list[str]) -> None:
+def test_windows_are_looked_for_in_the_same_labels(series: list[np.ndarray], calls: list[str]) -> None:
+    for length in (5, 10, 15):
+        config = replace(CONFIG, length=length, top=2)
+        found = mine_once(series, config=config, seed=0)
+        alone = mine(series, config=config, rng=derive(0, "mining"))
+        assert repr(found) == repr(alone)
+        for pst, other in zip(found.sets, alone.sets, strict=True):
+            np.testing.assert_array_equal(pst.all_occurrences, other.all_occurrences)
+    usable = [len(rows) - 20 for rows in series]
+    short = mine_once(series, config=CONFIG, seed=0, usable=usable)
+    assert all(
+        (pst.all_occurrences[:, 1] + 10 <= np.array(usable)[pst.all_occurrences[:, 0]]).all() for pst in short.sets
+    )
+    assert len(calls) == 1
+    with pytest.raises(InvalidDataError, match="W=10, but the series have 3 to 3 rows"):
+        mine_once(series, config=CONFIG, seed=0, usable=[3] * 4)
+
+
+def test_damaged_labels_are_found_again(series: list[np.ndarray], calls: list[str]) -> None:
     first = mine_once(series, config=CONFIG, seed=0)
-    (path,) = cache_folder().rglob("mining.safetensors")
+    (path,) = cache_folder().rglob("labels.safetensors")
     good = path.read_bytes()
     path.write_bytes(good[: len(good) // 2])
     assert repr(mine_once(series, config=CONFIG, seed=0)) == repr(first)
@@ -67,8 +87,10 @@ def test_a_damaged_result_is_mined_again(series: list[np.ndarray], calls: list[s
     assert path.read_bytes() == good
 
 
-def test_forms_of_oat_share_what_was_mined(walk_dataset: minari.MinariDataset, tiny_oat: OAT, calls: list[str]) -> None:
+def test_forms_of_oat_share_their_labels(walk_dataset: minari.MinariDataset, tiny_oat: OAT, calls: list[str]) -> None:
     plain = AugmentedDataset(walk_dataset, tiny_oat, factor=2, seed=0).fit()
-    other = AugmentedDataset(walk_dataset, replace(tiny_oat, start="posterior"), factor=2, seed=0).fit()
+    other = AugmentedDataset(
+        walk_dataset, replace(tiny_oat, start="posterior", ends="recorded"), factor=2, seed=0
+    ).fit()
     assert repr(tiny_oat.mine(walk_dataset)) == repr(plain.mining) == repr(other.mining)
     assert len(calls) == 1
