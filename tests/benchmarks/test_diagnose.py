@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 from minari import MinariDataset
 
-from oat_gym import Jittering, domains
+from oat_gym import AugmentedDataset, Function, Jittering, Scaling, domains
 from oat_gym.metrics.steps import Scale, Steps
 from oat_gym.ope import PolicySet
 from oat_gym.spaces import FlatSpace
@@ -117,3 +117,22 @@ def test_rows_that_are_there_are_not_computed_again(tmp_path: Path) -> None:
     assert float(row["change"]) == pytest.approx(0.03, rel=0.1)
     text = (tmp_path / "steps.md").read_text()
     assert "| jittering | 1 |" in text and "{" not in text
+
+
+def test_ends_that_are_generated_are_counted_with_their_rewards(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location("diagnose_ends", SCRIPT.with_name("diagnose_ends.py"))
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    whole = domains.load("maze2d-umaze")
+    real = MinariDataset(whole.storage, episode_indices=whole.episode_indices[:4])
+    found = module.ends(AugmentedDataset(real, Scaling(sigma=0.5), factor=3, seed=0), 4)
+    assert found["share_generated"] == found["ends_generated"] == 100
+    assert found["end_reward_recorded"] == 1  # the maze's episodes terminate at the goal
+    assert 0 < abs(found["end_reward"] - 1) < 2
+    assert found["other_reward_recorded"] == 0
+    copies = module.ends(AugmentedDataset(real, Function(lambda episode, rng: episode), factor=2, seed=0), 4)
+    row = {"dataset": "maze", "variant": "x", "seed": 0, **{name: f"{value}" for name, value in copies.items()}}
+    module.write(tmp_path, [row, row | {"seed": 1}])
+    assert len((tmp_path / "ends.csv").read_text().splitlines()) == 3
+    assert "| maze | x | 2 |" in (tmp_path / "ends.md").read_text()
