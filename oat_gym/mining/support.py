@@ -49,11 +49,11 @@ def count_tdss(labels: Sequence[ArrayLike], length: int, *, aligned: bool = Fals
 
     Args:
         labels: list of (T_i,) integer sequences; lengths may differ.
-        length: W >= 1. Sequences shorter than W hold no window.
+        length: W >= 1. Sequences shorter than W, empty ones too, hold no window.
         aligned: count sequences that hold the TDSS at the same position, instead of anywhere.
 
     Raises:
-        InvalidDataError: no sequence, an empty one, or labels that are not integers.
+        InvalidDataError: no sequence, no label, or labels that are not integers.
         ConfigurationError: a length below 1.
 
     >>> table = count_tdss([[0, 0, 1, 2], [5, 0, 1, 1], [0, 1]], 2)
@@ -212,12 +212,13 @@ def _join(labels: Sequence[ArrayLike]) -> tuple[Ints, Ints]:
         raise InvalidDataError("The list of label sequences is empty; expected at least one (T,) array.")
     arrays = [np.asarray(item) for item in labels]
     for index, array in enumerate(arrays):
-        if array.ndim != 1 or len(array) == 0 or array.dtype.kind not in "iu":
+        if array.ndim != 1 or array.dtype.kind not in "iu":
             raise InvalidDataError(
-                f"Label sequence {index} has shape {array.shape} and type {array.dtype}; "
-                "expected (T,) integers with at least one label."
+                f"Label sequence {index} has shape {array.shape} and type {array.dtype}; expected (T,) integers."
             )
     flat = np.concatenate(arrays).astype(np.int64)
+    if len(flat) == 0:
+        raise InvalidDataError(f"The {len(arrays)} label sequences hold no label; expected at least one.")
     lengths = np.array([len(array) for array in arrays], dtype=np.int64)
     return np.unique(flat, return_inverse=True)[1].astype(np.int64), lengths
 

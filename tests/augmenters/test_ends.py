@@ -11,14 +11,14 @@ from gymnasium import spaces
 
 from oat_gym import OAT, TDA, AugmentedDataset, MiningConfig
 from oat_gym.augmenters.stitched import StitchingAugmenter
-from oat_gym.errors import InvalidDataError
+from oat_gym.errors import AugmentationWarning, InvalidDataError
 from tests.conftest import install_dataset, walks
 
 BOX = spaces.Box(-100, 100, (2,)), spaces.Box(-1, 1, (2,))
 
 
 def ending(*, length: int = 12) -> minari.MinariDataset:
-    """Return twelve episodes of 12 to 16 steps: those of even number terminate, with a reward of 1; all other rewards are 0."""
+    """Return twelve episodes of 12 to 16 steps: those of even number terminate, for a reward of 1; others are 0."""
     buffers = []
     for number, buffer in enumerate(walks(12, length)):
         last = np.arange(len(buffer.rewards)) == len(buffer.rewards) - 1
@@ -74,6 +74,26 @@ def test_labels_are_of_all_steps_and_mined_windows_of_the_usable_ones(tiny_oat: 
     assert kept.sets
     for pst in kept.sets:
         assert (pst.all_occurrences[:, 1] + 6 <= last[pst.all_occurrences[:, 0]]).all()
+
+
+def test_an_episode_of_one_step_that_terminates_is_copied(forms: list[StitchingAugmenter]) -> None:
+    walk = walks(12, 16)
+    died = np.array([True])
+    short = replace(
+        walk[0],
+        observations=np.zeros((2, 2), np.float32),
+        actions=np.zeros((1, 2), np.float32),
+        rewards=np.ones(1),
+        terminations=died,
+        truncations=~died,
+    )
+    real = install_dataset("test/one-step-v0", [short, *walk[1:]], *BOX)
+    for form in forms:
+        with pytest.warns(AugmentationWarning, match="exact copies"):
+            data = AugmentedDataset(real, replace(form, ends="recorded"), factor=2).fit()
+        assert data[12].rewards.tolist() == [1.0]
+        assert not data.provenance(12).mask.any()
+        assert data.provenance(13).mask.any()
 
 
 @pytest.mark.parametrize("form", [OAT(mining=MiningConfig(n_clusters=2, length=6)), TDA(length=6)])

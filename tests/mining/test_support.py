@@ -71,7 +71,21 @@ def test_long_windows_of_many_labels_stay_exact():
     assert support_curve(sequences, [300], aligned=True) == {300: 1}
 
 
+def test_empty_sequences_hold_no_window_and_keep_their_number():
+    nothing = np.empty(0, dtype=np.int64)
+    one, other = [0, 1, 1], [1, 1, 0, 1]
+    full = count_tdss([one, other], 2)
+    gaps = count_tdss([nothing, one, nothing, nothing, other, nothing], 2)
+    np.testing.assert_array_equal(gaps.support, full.support)
+    np.testing.assert_array_equal(gaps.first, full.first * [3, 1] + [1, 0])
+    np.testing.assert_array_equal(gaps.windows_of(0), full.windows_of(0) * [3, 1] + [1, 0])
+    assert support_curve([nothing, one, other]) == support_curve([one, other])
+    assert longest_length([nothing, one, other], 2) == longest_length([one, other], 2)
+
+
 def test_bad_input():
+    with pytest.raises(InvalidDataError, match="2 label sequences hold no label"):
+        count_tdss([np.empty(0, dtype=np.int64)] * 2, 1)
     with pytest.raises(InvalidDataError, match="empty"):
         count_tdss([], 2)
     for labels in ([[]], [[0.5, 1.0]], [[[1, 2]]]):
