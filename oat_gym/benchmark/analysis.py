@@ -23,7 +23,8 @@ MEAN = "mean"
 class Finding:
     """The improvement of some datasets by one variant, for one family of estimators or "mean", by one metric.
 
-    `families` are those that it is of: a mean leaves out families that failed on either side.
+    `families` are those that it is of: a mean leaves out families that failed on either side. `baseline` is the variant
+    that it is compared with.
     """
 
     datasets: tuple[str, ...]
@@ -32,6 +33,7 @@ class Finding:
     metric: Metric
     improvement: Improvement
     families: tuple[str, ...]
+    baseline: str = NONE
 
 
 @dataclass
@@ -73,19 +75,21 @@ class Analysis:
             return np.empty(0)
         return self._draw(dataset, variant, family, tuple(cell.seed for cell in cells), metric).points
 
-    def finding(self, dataset: str, variant: str, family: str, metric: Metric) -> Finding | None:
-        """Return an improvement; None where a side was not measured."""
-        families = self.results.families if family == MEAN else (family,)
-        both = [name for name in families if self._seeds(dataset, variant, (name,))]
-        seeds = self._seeds(dataset, variant, both)
+    def finding(
+        self, dataset: str, variant: str, family: str, metric: Metric, *, baseline: str = NONE
+    ) -> Finding | None:
+        """Return the improvement over a baseline; None where a side was not measured."""
+        families, sides = self.results.families if family == MEAN else (family,), (baseline, variant)
+        both = [name for name in families if self._seeds(dataset, sides, (name,))]
+        seeds = self._seeds(dataset, sides, both)
         if not both or not seeds or dataset not in self.with_truth():
             return None
-        before = [self._draw(dataset, NONE, name, seeds, metric) for name in both]
+        before = [self._draw(dataset, baseline, name, seeds, metric) for name in both]
         after = [self._draw(dataset, variant, name, seeds, metric) for name in both]
-        cell = self.cells(dataset, NONE, both[0])[0]
+        cell = self.cells(dataset, baseline, both[0])[0]
         n_policies, n_episodes = len(cell.policies), int(cell.record["n_episodes"])
         improvement = improve(before, after, metric, n_policies=n_policies, n_episodes=n_episodes)
-        return Finding((dataset,), variant, family, metric, improvement, tuple(both))
+        return Finding((dataset,), variant, family, metric, improvement, tuple(both), baseline)
 
     def over(self, datasets: Sequence[str], variant: str, family: str, metric: Metric) -> Finding | None:
         """Return the mean improvement over several datasets; None where none was measured."""
@@ -109,10 +113,10 @@ class Analysis:
                         if found is not None:
                             yield found
 
-    def _seeds(self, dataset: str, variant: str, families: Sequence[str]) -> tuple[int, ...]:
-        """Return the seeds that both sides have for all of some families."""
-        sides = [self._cells.get((dataset, side, name), {}) for side in (NONE, variant) for name in families]
-        return tuple(sorted(set[int].intersection(*(set(side) for side in sides)))) if sides else ()
+    def _seeds(self, dataset: str, sides: Sequence[str], families: Sequence[str]) -> tuple[int, ...]:
+        """Return the seeds that both sides, variants, have for all of some families."""
+        found = [self._cells.get((dataset, side, name), {}) for side in sides for name in families]
+        return tuple(sorted(set[int].intersection(*(set(part) for part in found)))) if found else ()
 
     def _draw(self, dataset: str, variant: str, family: str, seeds: tuple[int, ...], metric: Metric) -> Draws:
         key = (dataset, variant, family, seeds, metric)

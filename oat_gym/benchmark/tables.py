@@ -24,6 +24,11 @@ SIGNS = {"helps": "+", "hurts": "-", "no evidence": "", "not measured": ""}
 EXPERT = "expert"
 """Name of the policy that others are tested against in table 1."""
 
+RIVALS = ("oat-paper", "oat")
+"""The forms of OAT that every other variant is compared with."""
+RIVALRY: tuple[Metric, ...] = ("mae", "rank_correlation")
+"""The metrics by which they are: those of the paper's claim to be ahead of every other method."""
+
 
 @dataclass(frozen=True)
 class Table:
@@ -58,6 +63,12 @@ def all_tables(analysis: Analysis) -> tuple[Table, ...]:
     made += [paper_table(analysis, level, metric) for level in paper.LEVELS for metric in METRICS]
     made += [dataset_table(analysis, dataset) for dataset in analysis.with_truth()]
     made += [help_table(analysis, dataset, metric) for dataset in analysis.with_truth() for metric in METRICS]
+    made += [
+        help_table(analysis, dataset, metric, baseline=baseline)
+        for dataset in analysis.with_truth()
+        for metric in RIVALRY
+        for baseline in RIVALS
+    ]
     made.append(improvement_table(analysis))
     return tuple(table for table in made if table is not None)
 
@@ -131,23 +142,29 @@ def dataset_table(analysis: Analysis, dataset: str) -> Table:
     return Table(f"dataset-{dataset}", caption, ("estimator", "variant", *METRICS.values()), tuple(rows))
 
 
-def help_table(analysis: Analysis, dataset: str, metric: Metric) -> Table | None:
-    """Return whether each variant helped each estimator, and their mean: the improvement, its interval, the verdict."""
+def help_table(analysis: Analysis, dataset: str, metric: Metric, *, baseline: str = NONE) -> Table | None:
+    """Return whether each variant helped each estimator, and their mean: the improvement, its interval, the verdict.
+
+    With a `baseline` other than no augmentation the table says which variants are better and which are worse than it.
+    """
     columns = (MEAN, *analysis.results.families)
     rows: list[tuple[str, ...]] = []
-    for variant in analysis.results.variants:
-        found = [None if variant == NONE else analysis.finding(dataset, variant, name, metric) for name in columns]
+    for variant in (name for name in analysis.results.variants if name not in (NONE, baseline)):
+        found = [analysis.finding(dataset, variant, name, metric, baseline=baseline) for name in columns]
         if any(each is not None for each in found):
             seeds = max(each.improvement.n_seeds for each in found if each is not None)
             rows.append((variant, str(seeds), *(_verdict_text(each) for each in found)))
     if not rows:
         return None
     unit = "percent less error" if metric == "mae" else "in its own unit"
+    plain = baseline == NONE
+    question, other = ("Did it help", "no augmentation") if plain else (f"Is it better than {baseline}", baseline)
     caption = (
-        f"Did it help on {dataset}? Improvement of the {METRICS[metric]} over no augmentation ({unit}, positive is "
+        f"{question} on {dataset}? Improvement of the {METRICS[metric]} over {other} ({unit}, positive is "
         f"better), 95% interval and verdict. {_notes(analysis, {dataset: dataset})}"
     )
-    return Table(f"helped-{metric}-{dataset}", caption, ("variant", "seeds", *columns), tuple(rows))
+    name = f"helped-{metric}-{dataset}" if plain else f"against-{baseline}-{metric}-{dataset}"
+    return Table(name, caption, ("variant", "seeds", *columns), tuple(rows))
 
 
 def _verdict_text(found: Finding | None) -> str:
@@ -155,7 +172,8 @@ def _verdict_text(found: Finding | None) -> str:
         return "-"
     change = found.improvement
     numbers = [format_number(number) for number in (change.value, change.low, change.high)]
-    word = f" {change.verdict}" if change.verdict in ("helps", "hurts") else ""
+    words = ("helps", "hurts") if found.baseline == NONE else ("better", "worse")
+    word = {"helps": f" {words[0]}", "hurts": f" {words[1]}"}.get(change.verdict, "")
     return f"{numbers[0]} ({numbers[1]} to {numbers[2]}){word}"
 
 

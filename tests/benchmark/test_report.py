@@ -17,7 +17,7 @@ from oat_gym.benchmark.results import Results, Setting, cell_rows, estimate_rows
 from oat_gym.benchmark.scores import METRICS
 from oat_gym.benchmark.store import CellResult, read_result, write_result
 from oat_gym.benchmark.story import best_sentences, groups_of, sentence
-from oat_gym.benchmark.tables import all_tables, dataset_table, paper_table, write_tables
+from oat_gym.benchmark.tables import all_tables, dataset_table, help_table, paper_table, write_tables
 from oat_gym.errors import CacheError, ConfigurationError
 
 POLICIES = tuple(f"p{number}" for number in range(7))
@@ -83,6 +83,21 @@ def test_verdicts_follow_the_errors(analysis: Analysis) -> None:
     worse = sentence(verdicts["scaling"], of="scaling")
     numbers = [float(part) for part in re.findall(r"-?\d+(?:\.\d+)?", worse.split("%", 1)[1].replace("95%", ""))]
     assert "raises the error by 120%" in worse and numbers[0] < 120 < numbers[1]  # the interval is of the same sign
+
+
+def test_variants_are_compared_with_one_another_in_pairs(analysis: Analysis) -> None:
+    table = help_table(analysis, "adroit-door-human", "mae", baseline="oat-paper")
+    rows = {row[0]: dict(zip(table.header, row, strict=True)) for row in table.rows}
+    assert table.name == "against-oat-paper-mae-adroit-door-human"
+    assert "better than oat-paper" in table.caption and "over oat-paper" in table.caption
+    assert set(rows) == {"jittering", "scaling"}
+    assert all(row["mean"].endswith(") worse") and row["FQE"].endswith(") worse") for row in rows.values())
+    place = ("adroit-door-human", "mean", "mae")
+    one = analysis.finding(place[0], "scaling", *place[1:], baseline="oat-paper").improvement
+    other = analysis.finding(place[0], "oat-paper", *place[1:], baseline="scaling").improvement
+    assert one.effect == pytest.approx(-other.effect)
+    assert one.standard_error == pytest.approx(other.standard_error)
+    assert help_table(analysis, "adroit-door-human", "mae", baseline="oat") is None  # not measured
 
 
 def test_a_family_that_failed_on_one_side_is_left_out_of_the_mean_of_both() -> None:
