@@ -42,9 +42,9 @@ class OAT(StitchingAugmenter):
         seam: "contiguous" (Minari's form), "literal" (the paper's: tuples outside the span keep their own next state,
             visible in `transitions()`), or "matched" (of `candidates` samples the one with the least seam jump).
         candidates: how many samples "matched" chooses from.
-        ends: whether a span may hold the step in which an episode terminates: "generated" (yes, as in the paper), or
-            "recorded" (no: an episode ends as it did, with its own last reward, since p(s|z) and p(r|z) know nothing of
-            terminations). Truncated episodes have no such step.
+        ends: "recorded": no span holds the step in which an episode terminates, so that episodes end as they did, with
+            their own last reward; "generated": one may, as in the paper, where nothing models terminations and an
+            outcome that is paid at the end is replaced by an ordinary reward. Truncated episodes have no such step.
         rewards: "modelled": as p(r|z) gives them, as in the paper, or "recorded": the nearest reward that the data
             holds, so that rewards of a few values (0 but for the last step, stages) keep them.
         features: the keys of a Dict observation space that are mined; None takes the whole observation.
@@ -103,6 +103,7 @@ class OAT(StitchingAugmenter):
     def _mine(self, source: Source, *, seed: int, progress: ProgressCallback) -> MiningResult:
         columns, times = _feature_columns(self, source), _times(self, source)
         series = [rows[:-1][:, columns] for rows in source.state_matrices()]
+        self.check_room(source, self.mining.length if isinstance(self.mining.length, int) else 1)
         usable = self.usable(source).tolist()
         return mine_once(series, config=self.mining, times=times, usable=usable, seed=seed, progress=progress)
 

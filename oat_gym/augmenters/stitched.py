@@ -45,7 +45,7 @@ class StitchingAugmenter(GenerativeAugmenter):
     actions: Actions = "behavior"
     seam: Seam = "contiguous"
     candidates: int = 16
-    ends: Ends = "generated"
+    ends: Ends = "recorded"
     rewards: Rewards = "modelled"
 
     def __post_init__(self) -> None:
@@ -63,10 +63,22 @@ class StitchingAugmenter(GenerativeAugmenter):
         terminated = [bool(episode.terminations[-1]) for episode in source.episodes]
         return source.lengths - np.array(terminated, dtype=np.int64)
 
+    def check_room(self, source: Source, length: int) -> None:
+        """Raise `InvalidDataError` unless spans of `length` steps may lie somewhere."""
+        usable = self.usable(source)
+        if usable.max() < length:
+            raise InvalidDataError(
+                f"No episode has the {length} steps of a sub-trajectory before the step in which it terminates, which "
+                f"stays as recorded: the {len(usable)} episodes have {usable.min()} to {usable.max()}. Use a shorter "
+                "length, or ends='generated' to generate terminations as other steps are."
+            )
+
     @classmethod
     def preset(cls, preset: Literal["default", "paper"]) -> Self:
-        """Return a named configuration: "default", or "paper" (appendix B.2: literal seams, 100 updates of 4 spans)."""
-        return cls() if preset == "default" else cls(model=VAEMDPConfig.from_preset(preset), seam="literal")
+        """Return a named configuration: "default", or "paper" (appendix B.2: 100 updates of 4 spans, literal seams)."""
+        if preset == "default":
+            return cls()
+        return cls(model=VAEMDPConfig.from_preset(preset), seam="literal", ends="generated")
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,6 @@ from oat_gym.generation.config import check_integer
 from oat_gym.progress import ProgressCallback, silent
 from oat_gym.source import Source
 
-_ADVICE = "Use TDA(length={half})."
-
 
 @dataclass(frozen=True)
 class TDA(StitchingAugmenter):
@@ -49,12 +47,12 @@ class TDA(StitchingAugmenter):
     def check(self, source: Source) -> None:
         """Raise where the spaces cannot be modelled or every episode is shorter than W."""
         super().check(source)
-        check_length(source.lengths, self.length, advice=_ADVICE)
+        check_length(source.lengths, self.length, advice="Use TDA(length={half}).")
 
     def windows(self, source: Source, *, seed: int) -> Windows:
         """Return the window of each episode that has room for one, its first step uniform over all that it can be."""
+        self.check_room(source, self.length)
         usable = self.usable(source)
-        check_length(usable, self.length, advice=_ADVICE)
         rows = [
             (i, int(derive(seed, "window", i).integers(steps - self.length + 1)))
             for i, steps in enumerate(usable.tolist())

@@ -113,7 +113,7 @@ VARIANTS: dict[str, Variant] = {
         _baseline("permutation", "Permutation"),
         _baseline("jittering", "Jittering"),
         _baseline("scaling", "Scaling"),
-        _baseline("tda", "TDA"),
+        Variant("tda", TDA(ends="generated"), paper="TDA", note="TDA: windows anywhere, ends of episodes included"),
         Variant(
             "oat-posterior",
             OAT(start="posterior"),
@@ -159,16 +159,16 @@ VARIANTS: dict[str, Variant] = {
             note="as oat-matched, one synthetic episode for each real one: synthetic steps weigh half",
         ),
         Variant(
-            "oat-ends",
-            OAT(ends="recorded"),
+            "oat-cut",
+            OAT(ends="generated"),
             use_augmented=None,
-            note="as oat, and episodes terminate as recorded: no span holds their last step",
+            note="as oat, and spans may hold the step in which an episode terminates, as in the paper",
         ),
         Variant(
             "oat-kept",
-            OAT(start="posterior", seam="matched", observation_noise=False, ends="recorded", rewards="recorded"),
+            OAT(start="posterior", seam="matched", observation_noise=False, rewards="recorded"),
             use_augmented=None,
-            note="as oat-smooth, with recorded terminations, and rewards that the data holds",
+            note="as oat-smooth, with rewards that the data holds",
         ),
         Variant(
             "oat-jitter",

@@ -311,6 +311,7 @@ def test_constant_features_and_episodes_of_one_step_are_modelled() -> None:
         mining=MiningConfig(n_clusters=2, length=1),
         model=VAEMDPConfig(max_updates=5),
         behavior=BehaviorConfig(max_updates=5),
+        ends="generated",
     )
     for episode in AugmentedDataset(real, config, factor=2):
         np.testing.assert_array_equal(episode.observations[:, 1], 7)

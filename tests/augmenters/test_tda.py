@@ -20,7 +20,7 @@ QUICK = {"model": VAEMDPConfig(max_updates=20), "behavior": BehaviorConfig(max_u
 
 
 def _starts(lengths: list[int], width: int, *, seed: int = 0) -> np.ndarray:
-    return TDA(length=width).windows(SimpleNamespace(lengths=np.array(lengths)), seed=seed).sets[0]  # type: ignore[arg-type]
+    return TDA(length=width, ends="generated").windows(SimpleNamespace(lengths=np.array(lengths)), seed=seed).sets[0]  # type: ignore[arg-type]
 
 
 def test_windows_are_uniform_over_all_first_steps() -> None:

@@ -1,7 +1,7 @@
 """What augmentation does to the ends of episodes: how many last steps are generated, and with which rewards.
 
     python tests/benchmarks/diagnose_ends.py --out FOLDER [--datasets icu-sepsis-features,...]
-        [--variants oat-paper,oat,oat-ends] [--seeds 0,1,2]
+        [--variants oat-paper,oat-cut,oat] [--seeds 0,1,2]
 
 Settings, and so the trained models in the cache, are those of `oat-gym bench`. Writes `FOLDER/ends.csv`, a row for each
 dataset, variant and seed, and `FOLDER/ends.md`, their means.
@@ -107,7 +107,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--datasets", default=DATASETS)
-    parser.add_argument("--variants", default="oat-paper,oat,oat-ends")
+    parser.add_argument("--variants", default="oat-paper,oat-cut,oat")
     parser.add_argument("--seeds", default="0,1,2")
     arguments = parser.parse_args()
     rows: list[dict[str, object]] = []

@@ -90,7 +90,7 @@ def test_damaged_labels_are_found_again(series: list[np.ndarray], calls: list[st
 def test_forms_of_oat_share_their_labels(walk_dataset: minari.MinariDataset, tiny_oat: OAT, calls: list[str]) -> None:
     plain = AugmentedDataset(walk_dataset, tiny_oat, factor=2, seed=0).fit()
     other = AugmentedDataset(
-        walk_dataset, replace(tiny_oat, start="posterior", ends="recorded"), factor=2, seed=0
+        walk_dataset, replace(tiny_oat, start="posterior", ends="generated"), factor=2, seed=0
     ).fit()
     assert repr(tiny_oat.mine(walk_dataset)) == repr(plain.mining) == repr(other.mining)
     assert len(calls) == 1
