@@ -207,8 +207,8 @@ def test_the_cache_is_listed_and_cleared(walk_dataset: minari.MinariDataset, tin
     AugmentedDataset(walk_dataset, tiny_oat, factor=2).fit()
     runner = CliRunner()
     listed = runner.invoke(cli.app, ["cache", "list"])
-    assert "1 entries" in listed.output
+    assert "2 entries" in listed.output  # the labels and the models
     path = runner.invoke(cli.app, ["cache", "path"]).output.strip()
     assert Path(path).is_dir()
-    assert "Deleted 1 entries" in runner.invoke(cli.app, ["cache", "clear"]).output
+    assert "Deleted 2 entries" in runner.invoke(cli.app, ["cache", "clear"]).output
     assert "0 entries" in runner.invoke(cli.app, ["cache", "list"]).output
