@@ -26,9 +26,9 @@ _DATASET = "dataset"
 class CacheItem:
     """One thing that the cache keeps.
 
-    `kind` is "fit" (labels, or what was mined with the trained models), "dataset" (a conversion to Minari's format) or "other". `size` is in
-    bytes; `last_used` is when a file of it was last written or, as far as the disk keeps that, read. `version` is the
-    cache format of an entry, None where the thing has none.
+    `kind` is "fit" (labels, or what was mined with the trained models), "dataset" (a conversion to Minari's format) or
+    "other". `size` is in bytes; `last_used` is when a file of it was last written or, as far as the disk keeps that,
+    read. `version` is the cache format of an entry, None where the thing has none.
     """
 
     path: Path
