@@ -29,6 +29,7 @@ from oat_gym.source import Source
 FloatArray = npt.NDArray[np.float64]
 COLUMNS = {
     "share_generated": "generated steps, %",
+    "terminating": "episodes that terminate, %",
     "ends_generated": "of terminations, on a generated step, %",
     "end_reward": "reward there",
     "end_reward_recorded": "as recorded",
@@ -45,6 +46,7 @@ def ends(data: AugmentedDataset, n_real: int) -> dict[str, float]:
     new, old = mask & last, mask & ~last
     return {
         "share_generated": 100 * float(mask.mean()),
+        "terminating": 100 * float(last.sum()) / len(parts),
         "ends_generated": 100 * _mean(mask[last]),
         "end_reward": _mean(made[new]),
         "end_reward_recorded": _mean(recorded[new]),
@@ -54,13 +56,21 @@ def ends(data: AugmentedDataset, n_real: int) -> dict[str, float]:
 
 
 def _episode(data: AugmentedDataset, number: int) -> tuple[npt.NDArray[np.bool_], ...]:
-    """Return for each step whether it is generated and whether it terminates, its reward, and the recorded one."""
+    """Return for each step whether it is generated and whether it terminates, its reward, and the recorded one.
+
+    Methods that make whole trajectories give them other lengths: then no recorded step stands for a generated one.
+    """
     origin, episode = data.provenance(number), data[number]
-    return origin.mask, episode.terminations, episode.rewards, data[origin.source].rewards
+    recorded = data[origin.source].rewards
+    if len(recorded) != len(episode.rewards):
+        recorded = np.full(len(episode.rewards), np.nan)
+    return origin.mask, episode.terminations, episode.rewards, recorded
 
 
 def _mean(values: npt.NDArray[np.generic]) -> float:
-    return float(np.asarray(values, dtype=np.float64).mean()) if len(values) else float("nan")
+    known = np.asarray(values, dtype=np.float64)
+    known = known[np.isfinite(known)]
+    return float(known.mean()) if len(known) else float("nan")
 
 
 def measure(name: str, real: MinariDataset, variant: str, seed: int) -> dict[str, object]:

@@ -127,7 +127,7 @@ def test_ends_that_are_generated_are_counted_with_their_rewards(tmp_path: Path) 
     whole = domains.load("maze2d-umaze")
     real = MinariDataset(whole.storage, episode_indices=whole.episode_indices[:4])
     found = module.ends(AugmentedDataset(real, Scaling(sigma=0.5), factor=3, seed=0), 4)
-    assert found["share_generated"] == found["ends_generated"] == 100
+    assert found["share_generated"] == found["terminating"] == found["ends_generated"] == 100
     assert found["end_reward_recorded"] == 1  # the maze's episodes terminate at the goal
     assert 0 < abs(found["end_reward"] - 1) < 2
     assert found["other_reward_recorded"] == 0
