@@ -132,11 +132,13 @@ def table_2(analysis: Analysis) -> Table | None:
 
 
 def dataset_table(analysis: Analysis, dataset: str) -> Table:
-    """Return all metrics of one dataset: a row for each estimator (and their mean) and variant."""
+    """Return all metrics of one dataset: a row for each estimator (and their mean) and variant that was tried on it."""
+    tried = {cell.variant for cell in analysis.results.cells if cell.dataset == dataset}
     rows = [
         (family, variant, *(cell_text(analysis, dataset, variant, family, metric) for metric in METRICS))
         for family in (*analysis.results.families, MEAN)
         for variant in analysis.results.variants
+        if variant in tried
     ]
     caption = f"All metrics of {dataset}. {_notes(analysis, {dataset: dataset})}"
     return Table(f"dataset-{dataset}", caption, ("estimator", "variant", *METRICS.values()), tuple(rows))

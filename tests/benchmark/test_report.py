@@ -85,6 +85,13 @@ def test_verdicts_follow_the_errors(analysis: Analysis) -> None:
     assert "raises the error by 120%" in worse and numbers[0] < 120 < numbers[1]  # the interval is of the same sign
 
 
+def test_a_variant_that_was_not_tried_on_a_dataset_has_no_row_there() -> None:
+    whole = results_of({"adroit-door-human": True})
+    kept = tuple(cell for cell in whole.cells if cell.variant != "scaling")
+    table = dataset_table(Analysis(Results(whole.setting, kept, whole.manifests, ())), "adroit-door-human")
+    assert {row[1] for row in table.rows} == {"none", "oat-paper", "jittering"}
+
+
 def test_variants_are_compared_with_one_another_in_pairs(analysis: Analysis) -> None:
     table = help_table(analysis, "adroit-door-human", "mae", baseline="oat-paper")
     rows = {row[0]: dict(zip(table.header, row, strict=True)) for row in table.rows}
