@@ -73,6 +73,16 @@ def fingerprint(**parts: object) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def digest_of(arrays: Mapping[str, npt.NDArray[Any]], text: str = "") -> str:
+    """Return the SHA-256 of named arrays (types, shapes and values, in the order of their names) and a text."""
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"|{name}|{array.dtype.str}|{array.shape}|".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
 class CacheEntry:
     """The items stored under one fingerprint.
 
@@ -185,7 +195,7 @@ def write_sealed(path: Path, arrays: Mapping[str, npt.NDArray[Any]], value: obje
     """
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     text = json.dumps(canonical(value), sort_keys=True)
-    header = {"digest": _digest(contiguous, text), "format": FORMAT_VERSION, "value": text}
+    header = {"digest": digest_of(contiguous, text), "format": FORMAT_VERSION, "value": text}
     # Under one key: safetensors writes several in any order, and equal content is to give equal bytes.
     write_atomically(path, save(contiguous, metadata={_HEADER: json.dumps(header, sort_keys=True)}))
 
@@ -213,7 +223,7 @@ def read_sealed(path: Path) -> tuple[Arrays, Any]:
             arrays = {str(name): np.array(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise CacheError(f"{path} is damaged: {error}.") from error
-    if digest != _digest(arrays, text):
+    if digest != digest_of(arrays, text):
         raise CacheError(f"{path} is damaged: its content does not match its digest.")
     return arrays, json.loads(text)
 
@@ -261,15 +271,6 @@ def _is_newer(path: Path) -> bool:
     except (OSError, CacheError):
         return False
     return False
-
-
-def _digest(arrays: Mapping[str, npt.NDArray[Any]], text: str) -> str:
-    digest = hashlib.sha256(text.encode())
-    for name in sorted(arrays):
-        array = arrays[name]
-        digest.update(f"|{name}|{array.dtype.str}|{array.shape}|".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
 
 
 def _fields(value: Any) -> dict[str, Any]:

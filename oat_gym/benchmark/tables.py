@@ -163,7 +163,7 @@ def help_table(analysis: Analysis, dataset: str, metric: Metric, *, baseline: st
     question, other = ("Did it help", "no augmentation") if plain else (f"Is it better than {baseline}", baseline)
     caption = (
         f"{question} on {dataset}? Improvement of the {METRICS[metric]} over {other} ({unit}, positive is "
-        f"better), 95% interval and verdict. {_notes(analysis, {dataset: dataset})}"
+        f"better), 95% interval and verdict. {_notes(analysis, {dataset: dataset}, signs=False)}"
     )
     name = f"helped-{metric}-{dataset}" if plain else f"against-{baseline}-{metric}-{dataset}"
     return Table(name, caption, ("variant", "seeds", *columns), tuple(rows))
@@ -306,8 +306,8 @@ def _method(variant: str) -> str:
     return f"{row} ({variant})" if row and row.lower() != variant else row or variant
 
 
-def _notes(analysis: Analysis, datasets: dict[str, str | None]) -> str:
-    """Return what a caption must say: setting, seeds, budget, signs, stand-ins."""
+def _notes(analysis: Analysis, datasets: dict[str, str | None], *, signs: bool = True) -> str:
+    """Return what a caption must say: seeds, setting, budget, stand-ins, and what means and `SIGNS` are."""
     there = [name for name in datasets.values() if name is not None]
     seeds: dict[str, set[int]] = {}
     for cell in analysis.results.cells:
@@ -315,12 +315,9 @@ def _notes(analysis: Analysis, datasets: dict[str, str | None]) -> str:
             seeds.setdefault(cell.variant, set()).add(cell.seed)
     most = max((len(part) for part in seeds.values()), default=0)
     fewer = ", ".join(f"{len(part)} for {name}" for name, part in seeds.items() if len(part) < most)
-    text = f"{most} seeds{f' ({fewer})' if fewer else ''}, mean ± standard deviation; "
-    text += f"{analysis.results.setting.describe()}; "
-    text += (
-        "; ".join(budget_lines(analysis.results))
-        + ". + or - : better or worse than no augmentation, 95% interval excludes zero."
-    )
+    text = f"{most} seeds{f' ({fewer})' if fewer else ''}{', mean ± standard deviation' if signs else ''}; "
+    text += f"{analysis.results.setting.describe()}; {'; '.join(budget_lines(analysis.results))}."
+    text += " + or - : better or worse than no augmentation, 95% interval excludes zero." if signs else ""
     stand_ins = stand_ins_of(there)
     return text + (f" Stand-ins, not the paper's data: {', '.join(stand_ins)}." if stand_ins else "")
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from oat_gym._rng import derive
-from oat_gym.cache import CacheEntry, fingerprint
+from oat_gym.cache import CacheEntry, digest_of, fingerprint
 from oat_gym.mining.pst import MiningConfig, MiningResult, check_long_enough, find_windows, label, series_lengths
 from oat_gym.mining.state import labelling_from_state, labelling_to_state
 from oat_gym.progress import ProgressCallback, silent
@@ -48,9 +47,8 @@ def mine_once(
     """
     check_long_enough(series_lengths(series) if usable is None else usable, config)
     settings = {name: getattr(config, name) for name in LABELLING}
-    entry = CacheEntry(
-        fingerprint(part="labels", config=settings, seed=seed, series=_digest(series), times=_digest(times or ()))
-    )
+    rows = {f"series/{i}": part for i, part in enumerate(series)} | {f"times/{i}": t for i, t in enumerate(times or ())}
+    entry = CacheEntry(fingerprint(part="labels", config=settings, seed=seed, rows=digest_of(rows)))
     with entry.lock():
         stored = entry.read("labels")
         if stored is None:
@@ -58,11 +56,3 @@ def mine_once(
             stored = labelling_to_state(found)
             entry.write("labels", *stored)
     return find_windows(labelling_from_state(*stored), config=config, usable=usable)
-
-
-def _digest(arrays: Sequence[FloatArray]) -> str:
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(f"{array.dtype.str}{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()

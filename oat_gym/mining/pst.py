@@ -258,7 +258,6 @@ def find_windows(found: Labelling, *, config: MiningConfig, usable: Sequence[int
     labels = found.labels
     if usable is not None:
         labels = tuple(rows[:count] for rows, count in zip(found.labels, usable, strict=True))
-        check_long_enough(usable, config)
     length = _window_length(labels, config)
     curve = support_curve(labels, aligned=config.aligned)
     table = count_tdss(labels, length, aligned=config.aligned)

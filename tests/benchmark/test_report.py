@@ -96,6 +96,7 @@ def test_variants_are_compared_with_one_another_in_pairs(analysis: Analysis) -> 
     table = help_table(analysis, "adroit-door-human", "mae", baseline="oat-paper")
     rows = {row[0]: dict(zip(table.header, row, strict=True)) for row in table.rows}
     assert table.name == "against-oat-paper-mae-adroit-door-human"
+    assert "no augmentation" not in table.caption
     assert "better than oat-paper" in table.caption and "over oat-paper" in table.caption
     assert set(rows) == {"jittering", "scaling"}
     assert all(row["mean"].endswith(") worse") and row["FQE"].endswith(") worse") for row in rows.values())

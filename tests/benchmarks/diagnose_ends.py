@@ -4,7 +4,7 @@
         [--variants oat-paper,oat-cut,oat] [--seeds 0,1,2]
 
 Settings, and so the trained models in the cache, are those of `oat-gym bench`. Writes `FOLDER/ends.csv`, a row for each
-dataset, variant and seed, and `FOLDER/ends.md`, their means.
+dataset, variant and seed (those that are there are not computed again), and `FOLDER/ends.md`, their means.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from oat_gym.benchmark.variants import find_variant, fit_length
 from oat_gym.cache import write_atomically
 from oat_gym.source import Source
 
-FloatArray = npt.NDArray[np.float64]
+Row = dict[str, str]
 COLUMNS = {
     "share_generated": "generated steps, %",
     "terminating": "episodes that terminate, %",
@@ -36,7 +37,7 @@ COLUMNS = {
     "other_reward": "reward of other generated steps",
     "other_reward_recorded": "recorded in their place",
 }
-DATASETS = "icu-sepsis-features,sepsis-mdp-features,sepsis-sim,tutor-sim,maze2d-umaze"
+DATASETS = "icu-sepsis-features,sepsis-mdp-features,sepsis-sim,maze2d-umaze"
 
 
 def ends(data: AugmentedDataset, n_real: int) -> dict[str, float]:
@@ -73,17 +74,17 @@ def _mean(values: npt.NDArray[np.generic]) -> float:
     return float(known.mean()) if len(known) else float("nan")
 
 
-def measure(name: str, real: MinariDataset, variant: str, seed: int) -> dict[str, object]:
+def measure(name: str, real: MinariDataset, variant: str, seed: str) -> Row:
     """Return a row."""
     chosen = find_variant(variant)
     if chosen.augmenter is None:
         raise SystemExit("The variant 'none' generates nothing.")
     augmenter = fit_length(chosen.augmenter, Source(real).lengths)
-    data = AugmentedDataset(real, augmenter, factor=chosen.factor, seed=seed)
+    data = AugmentedDataset(real, augmenter, factor=chosen.factor, seed=int(seed))
     with one_thread():
         data.fit(progress=False)
         found = ends(data, len(real))
-    commit = environment("cpu")["commit"]
+    commit = str(environment("cpu")["commit"])
     return {
         "dataset": name,
         "variant": variant,
@@ -93,7 +94,7 @@ def measure(name: str, real: MinariDataset, variant: str, seed: int) -> dict[str
     }
 
 
-def write(out: Path, rows: Sequence[dict[str, object]]) -> None:
+def write(out: Path, rows: Sequence[Row]) -> None:
     """Write the rows and their means over seeds."""
     text = io.StringIO()
     table = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
@@ -107,7 +108,7 @@ def write(out: Path, rows: Sequence[dict[str, object]]) -> None:
     ]
     for dataset, variant in dict.fromkeys((row["dataset"], row["variant"]) for row in rows):
         mine = [row for row in rows if (row["dataset"], row["variant"]) == (dataset, variant)]
-        means = [np.mean([float(str(row[column])) for row in mine]) for column in COLUMNS]
+        means = [np.mean([float(row[column]) for row in mine]) for column in COLUMNS]
         cells = [f"{mean:.3g}" if np.isfinite(mean) else "" for mean in means]
         lines.append(f"| {dataset} | {variant} | {len(mine)} | " + " | ".join(cells) + " |")
     write_atomically(out / "ends.md", ("\n".join(lines) + "\n").encode())
@@ -120,12 +121,14 @@ def main() -> None:
     parser.add_argument("--variants", default="oat-paper,oat-cut,oat")
     parser.add_argument("--seeds", default="0,1,2")
     arguments = parser.parse_args()
-    rows: list[dict[str, object]] = []
+    path = arguments.out / "ends.csv"
+    rows: list[Row] = list(csv.DictReader(path.read_text().splitlines())) if path.exists() else []
+    done = {(row["dataset"], row["variant"], row["seed"]) for row in rows}
     for name in arguments.datasets.split(","):
         real = domains.load(name)
-        for variant in arguments.variants.split(","):
-            for seed in arguments.seeds.split(","):
-                rows.append(measure(name, real, variant, int(seed)))
+        for key in itertools.product([name], arguments.variants.split(","), arguments.seeds.split(",")):
+            if key not in done:
+                rows.append(measure(name, real, *key[1:]))
                 print(rows[-1], flush=True)
                 write(arguments.out, rows)
 
