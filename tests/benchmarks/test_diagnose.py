@@ -132,7 +132,8 @@ def test_ends_that_are_generated_are_counted_with_their_rewards(tmp_path: Path) 
     assert 0 < abs(found["end_reward"] - 1) < 2
     assert found["other_reward_recorded"] == 0
     copies = module.ends(AugmentedDataset(real, Function(lambda episode, rng: episode), factor=2, seed=0), 4)
-    row = {"dataset": "maze", "variant": "x", "seed": "0", **{name: f"{value}" for name, value in copies.items()}}
+    numbers = {name: f"{value}" for name, value in copies.items()}
+    row = {"dataset": "maze", "variant": "x", "seed": "0", **numbers, "commit": "c"}
     module.write(tmp_path, [row, row | {"seed": "1"}])
     assert len((tmp_path / "ends.csv").read_text().splitlines()) == 3
     assert "| maze | x | 2 |" in (tmp_path / "ends.md").read_text()
