@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from oat_gym.benchmark.improvement import Improvement, improve, over_tasks
 from oat_gym.benchmark.results import Results
-from oat_gym.benchmark.scores import METRICS, Draws, Metric, draw_scores
+from oat_gym.benchmark.scores import METRICS, Draws, Metric, draw_scores, score
 from oat_gym.benchmark.store import CellResult
 from oat_gym.benchmark.variants import NONE
 
@@ -67,6 +67,16 @@ class Analysis:
         """Return the finished cells of one place in the tables, by seed."""
         found = self._cells.get((dataset, variant, family), {})
         return tuple(found[seed] for seed in sorted(found))
+
+    def floor(self, dataset: str) -> float | None:
+        """Return the mean absolute error of the mean recorded return, said of every policy; None where unknown.
+
+        An estimator that is further off tells less than the log's own average.
+        """
+        cell = next((cell for cell in self.results.cells if cell.dataset == dataset and cell.knows_truth), None)
+        if cell is None or dataset not in self.results.recorded:
+            return None
+        return float(score(np.full(len(cell.true), self.results.recorded[dataset][0]), cell.true, "mae"))
 
     def scores(self, dataset: str, variant: str, family: str, metric: Metric) -> FloatArray:
         """Return the metric of each seed, (S,); empty where nothing was measured."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
@@ -11,6 +12,7 @@ import numpy.typing as npt
 
 from oat_gym.domains import Task
 from oat_gym.ope import Policy
+from oat_gym.ope._normalised import discounts
 from oat_gym.ope.policy import PolicySet
 from oat_gym.ope.problem import flatten_policies
 from oat_gym.source import Source
@@ -62,6 +64,17 @@ def survey(source: Source, task: Task, starts: Batch | None, *, gamma: float | N
         starts="data" if features is None else _brief(features),
         computed=f"{_series('numpy')}, {_series('torch')}, {device.partition(':')[0]}",
     )
+
+
+def recorded_return(source: Source, *, gamma: float, horizon: int | None) -> tuple[float, float]:
+    """Return the mean discounted return of the recorded episodes' first `horizon` steps, and its standard error.
+
+    Said of every policy it is an estimate too, the least that any estimator has to beat. The error is NaN for one
+    episode.
+    """
+    returns = [rewards[:horizon] @ discounts(gamma, len(rewards[:horizon])) for rewards in source.rewards()]
+    spread = float(np.std(returns, ddof=1)) if len(returns) > 1 else math.nan
+    return float(np.mean(returns)), spread / math.sqrt(len(returns))
 
 
 def tell_apart(source: Source, policies: Mapping[str, Policy]) -> tuple[tuple[str, str], ...]:

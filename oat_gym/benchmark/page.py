@@ -121,6 +121,7 @@ def _dataset(analysis: Analysis, name: str) -> dict[str, Any]:
         "generated": [_generated(value) for _, value in _first_seeds(made) if value["synthetic"] is not None],
         "coverage": _coverage(made),
         "table": dataset_table(analysis, name) if known else None,
+        "floor": story.floor_sentence(analysis, name),
         "truth_picture": story.truth_picture(analysis, name) if known else None,
         "returns": story.returns_picture(analysis, name) if known else None,
         "estimates": [] if known else story.estimate_table(analysis, name),

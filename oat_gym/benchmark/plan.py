@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from oat_gym.benchmark.budget import Budget
-from oat_gym.benchmark.ground import Ground, survey
+from oat_gym.benchmark.ground import Ground, recorded_return, survey
 from oat_gym.benchmark.job import find_truth
 from oat_gym.benchmark.measure import environment
 from oat_gym.benchmark.protocol import Catalog, Job, Question, Suite, make_jobs
@@ -35,6 +35,7 @@ class Plan:
         missing: dataset -> why it cannot be run here, which says how to get it.
         unknown_truth: dataset -> why its policies' true values are unknown.
         truths: dataset -> true values of its policies, where they are known.
+        recorded: dataset -> mean return of its episodes and its standard error (`recorded_return`).
     """
 
     suite: Suite
@@ -42,6 +43,7 @@ class Plan:
     missing: dict[str, str]
     unknown_truth: dict[str, str]
     truths: dict[str, Truth]
+    recorded: dict[str, tuple[float, float]]
 
     @property
     def n_cells(self) -> int:
@@ -80,11 +82,13 @@ def make_plan(
     missing: dict[str, str] = {}
     unknown: dict[str, str] = {}
     truths: dict[str, Truth] = {}
+    recorded: dict[str, tuple[float, float]] = {}
     for name in suite.datasets:
         try:
             task = places.task_of(name)[1]
             source = Source(places.load(name, episodes=budget.episodes))
             ground = survey(source, task, question.starts(task), gamma=question.gamma, device=device)
+            recorded[name] = recorded_return(source, gamma=ground.gamma, horizon=ground.horizon)
         except (ConfigurationError, DatasetNotFoundError, InvalidDataError) as error:
             missing[name] = str(error)
             continue
@@ -95,7 +99,7 @@ def make_plan(
         else:
             truths[name] = truth
     jobs = make_jobs(content, variants, seeds=seeds, question=question, budget=budget, device=device)
-    return Plan(suite, jobs, missing, unknown, truths)
+    return Plan(suite, jobs, missing, unknown, truths, recorded)
 
 
 def write_manifest(folder: Path, plan: Plan, *, seeds: Sequence[int], device: str, command: str) -> Path:
@@ -124,6 +128,7 @@ def write_manifest(folder: Path, plan: Plan, *, seeds: Sequence[int], device: st
         "about": plan.suite.about,
         "unknown_truth": plan.unknown_truth,
         "truths": {name: _truth(truth) for name, truth in plan.truths.items()},
+        "recorded": plan.recorded,
         "jobs_order": list(variants),
         "notes": {name: variant.note for name, variant in variants.items()},
         "budget_line": plan.jobs[0].budget.describe(),

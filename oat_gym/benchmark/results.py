@@ -102,6 +102,16 @@ class Results:
         told = {name: why for manifest in self.manifests for name, why in manifest["missing"].items()}
         return {name: why for name, why in told.items() if name not in self.datasets}
 
+    @cached_property
+    def recorded(self) -> dict[str, tuple[float, float]]:
+        """Dataset -> (mean recorded return, standard error), of the last run on the ground that its cells stand on."""
+        return {
+            name: (float(mean), float(error))
+            for manifest in self.manifests
+            for name, (mean, error) in manifest.get("recorded", {}).items()
+            if _valued(manifest["grounds"][name]) in {_ground(cell) for cell in self.cells if cell.dataset == name}
+        }
+
     @property
     def unfinished(self) -> int:
         """Number of cells that the runs asked for and that are not there, or failed; the last run of a place counts."""

@@ -21,6 +21,8 @@ from oat_gym.ope import metrics as ope_metrics
 
 SIGNS = {"helps": "+", "hurts": "-", "no evidence": "", "not measured": ""}
 """What stands behind a number that differs from no augmentation with an interval that excludes zero."""
+FLOOR = "mean recorded return"
+"""In the place of an estimator: the log's own average, said of every policy."""
 EXPERT = "expert"
 """Name of the policy that others are tested against in table 1."""
 
@@ -132,7 +134,10 @@ def table_2(analysis: Analysis) -> Table | None:
 
 
 def dataset_table(analysis: Analysis, dataset: str) -> Table:
-    """Return all metrics of one dataset: a row for each estimator (and their mean) and variant that was tried on it."""
+    """Return all metrics of one dataset: a row for each estimator (and their mean) and variant that was tried on it.
+
+    The last row is the error of the mean recorded return, said of every policy (`Analysis.floor`).
+    """
     tried = {cell.variant for cell in analysis.results.cells if cell.dataset == dataset}
     rows = [
         (family, variant, *(cell_text(analysis, dataset, variant, family, metric) for metric in METRICS))
@@ -140,6 +145,9 @@ def dataset_table(analysis: Analysis, dataset: str) -> Table:
         for variant in analysis.results.variants
         if variant in tried
     ]
+    floor = analysis.floor(dataset)
+    if floor is not None:
+        rows.append((FLOOR, NONE, format_number(floor), *("-" for _ in list(METRICS)[1:])))
     caption = f"All metrics of {dataset}. {_notes(analysis, {dataset: dataset})}"
     return Table(f"dataset-{dataset}", caption, ("estimator", "variant", *METRICS.values()), tuple(rows))
 

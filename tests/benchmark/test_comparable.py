@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import logging
+import math
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from oat_gym import ope
 from oat_gym.benchmark import job as job_module
-from oat_gym.benchmark.ground import survey, tell_apart
+from oat_gym.benchmark.ground import recorded_return, survey, tell_apart
 from oat_gym.benchmark.plan import Plan, make_plan, write_manifest
 from oat_gym.benchmark.protocol import Catalog, Question
 from oat_gym.benchmark.results import read_results
@@ -208,6 +209,19 @@ def test_a_damaged_dataset_is_named_and_the_rest_is_planned() -> None:
     plan = plan_of(dataclasses.replace(tiny.CATALOG, datasets=datasets))
     assert plan.missing["line-human"] == "episode 3 holds a NaN"
     assert {job.dataset for job in plan.jobs} == {"line"}
+
+
+def test_the_recorded_return_is_discounted_up_to_the_horizon() -> None:
+    rewards = [episode.rewards for episode in tiny.CATALOG.load("line", episodes=None).iterate_episodes()]
+    returns = [sum(tiny.GAMMA**t * reward for t, reward in enumerate(each[: tiny.STEPS])) for each in rewards]
+    mean, error = plan_of(budget=dataclasses.replace(tiny.BUDGET, episodes=None)).recorded["line"]
+    assert mean == pytest.approx(np.mean(returns))
+    assert error == pytest.approx(np.std(returns, ddof=1) / math.sqrt(len(returns)))
+    source = Source(tiny.CATALOG.load("line", episodes=None))
+    short = [each[0] + 0.5 * each[1] for each in rewards]
+    assert recorded_return(source, gamma=0.5, horizon=2)[0] == pytest.approx(np.mean(short))
+    whole = [each.sum() for each in rewards]
+    assert recorded_return(source, gamma=1.0, horizon=None)[0] == pytest.approx(np.mean(whole))
 
 
 def test_a_task_without_truth_has_none_in_the_plan() -> None:

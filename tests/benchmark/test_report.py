@@ -16,13 +16,14 @@ from oat_gym.benchmark.protocol import Question
 from oat_gym.benchmark.results import Results, Setting, cell_rows, estimate_rows, to_csv, write_tidy
 from oat_gym.benchmark.scores import METRICS
 from oat_gym.benchmark.store import CellResult, read_result, write_result
-from oat_gym.benchmark.story import best_sentences, groups_of, sentence
+from oat_gym.benchmark.story import best_sentences, floor_sentence, groups_of, sentence
 from oat_gym.benchmark.tables import all_tables, dataset_table, help_table, paper_table, write_tables
 from oat_gym.errors import CacheError, ConfigurationError
 
 POLICIES = tuple(f"p{number}" for number in range(7))
 TRUE = np.linspace(0.0, 600.0, 7)
 QUESTION = {"initial": "reset", "behavior": "clone", "gamma": None}
+GROUND = {"data": "x", "computed": "numpy 2"}
 
 
 def cell(
@@ -37,7 +38,8 @@ def cell(
         replicates=values[:, None] + rng.normal(size=(7, 40)), true=TRUE if known else np.full(7, math.nan),
         true_errors=np.zeros(7), reason=reason,
         record={
-            "config": {"question": QUESTION}, "fingerprint": f"{dataset}{variant}{family}{seed}", "n_episodes": 25,
+            "config": {"question": QUESTION, "ground": GROUND},
+            "fingerprint": f"{dataset}{variant}{family}{seed}", "n_episodes": 25,
             "finished": float(seed), "gamma": 0.995, "horizon": 200, "truth_note": "" if known else "Nobody knows.",
             "environment": {"numpy": "2"}, "cost": {"cpu_seconds": 1.0, "wall_seconds": 2.0, "peak_memory_mb": 3.0},
         },
@@ -58,6 +60,7 @@ def results_of(datasets: dict[str, bool], *, seeds: int = 3, extra: tuple[CellRe
     manifest = {
         "question": QUESTION, "budget": {"name": "full"}, "datasets": [*datasets, "adroit-pen-human"],
         "jobs_order": list(ERRORS), "missing": {"adroit-pen-human": "run `minari download D4RL/pen/human-v2`"},
+        "grounds": dict.fromkeys(datasets, GROUND), "recorded": {name: [250.0, 20.0] for name in datasets},
         "cells": {}, "budget_line": "budget 'full'", "command": "oat-gym bench", "started": time.time(),
     }  # fmt: skip
     members = (*cells, *extra)
@@ -90,6 +93,25 @@ def test_a_variant_that_was_not_tried_on_a_dataset_has_no_row_there() -> None:
     kept = tuple(cell for cell in whole.cells if cell.variant != "scaling")
     table = dataset_table(Analysis(Results(whole.setting, kept, whole.manifests, ())), "adroit-door-human")
     assert {row[1] for row in table.rows} == {"none", "oat-paper", "jittering"}
+
+
+def test_the_logs_own_average_stands_below_the_estimators(analysis: Analysis) -> None:
+    off = float(np.abs(TRUE - 250).mean())
+    assert analysis.floor("adroit-door-human") == pytest.approx(off) and analysis.floor("logs") is None
+    *rows, last = dataset_table(analysis, "adroit-door-human").rows
+    assert last == ("mean recorded return", "none", f"{off:.0f}", "-", "-", "-")
+    assert not any("recorded" in cell for row in rows for cell in row)
+    told = floor_sentence(analysis, "adroit-door-human")
+    assert told in make_page((analysis.results,))
+    assert "250 on average (standard error 20)" in told and f"off by {off:.0f}, further than every estimator" in told
+    far = [cell("adroit-door-human", "none", "IS", seed, error=500.0) for seed in range(3)]
+    whole = results_of({"adroit-door-human": True})
+    kept = (*(part for part in whole.cells if (part.variant, part.family) != ("none", "IS")), *far)
+    worse = Analysis(Results(whole.setting, kept, whole.manifests, ()))
+    assert floor_sentence(worse, "adroit-door-human").endswith("further off without augmentation: IS.")
+    older = [{name: told for name, told in whole.manifests[0].items() if name != "recorded"}]
+    unknown = Analysis(Results(whole.setting, whole.cells, tuple(older), ()))
+    assert unknown.floor("adroit-door-human") is None and floor_sentence(unknown, "adroit-door-human") == ""
 
 
 def test_variants_are_compared_with_one_another_in_pairs(analysis: Analysis) -> None:
