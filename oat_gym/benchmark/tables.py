@@ -71,6 +71,7 @@ def all_tables(analysis: Analysis) -> tuple[Table, ...]:
         for metric in RIVALRY
         for baseline in RIVALS
     ]
+    made += [overview_table(analysis, metric) for metric in RIVALRY]
     made.append(improvement_table(analysis))
     return tuple(table for table in made if table is not None)
 
@@ -175,6 +176,38 @@ def help_table(analysis: Analysis, dataset: str, metric: Metric, *, baseline: st
     )
     name = f"helped-{metric}-{dataset}" if plain else f"against-{baseline}-{metric}-{dataset}"
     return Table(name, caption, ("variant", "seeds", *columns), tuple(rows))
+
+
+def overview_table(analysis: Analysis, metric: Metric) -> Table | None:
+    """Return the improvement of the mean over the estimators, a row for each dataset and a column for each variant.
+
+    The last rows count the datasets on which a variant helps and hurts. None for one dataset, which has a table itself.
+    """
+    datasets, variants = analysis.with_truth(), [name for name in analysis.results.variants if name != NONE]
+    found = {
+        (dataset, variant): analysis.finding(dataset, variant, MEAN, metric)
+        for dataset in datasets
+        for variant in variants
+    }
+    if len(datasets) < 2 or not any(found.values()):
+        return None
+    rows = [(name, *(_verdict_text(found[name, variant]) for variant in variants)) for name in datasets]
+    for verdict in ("helps", "hurts"):
+        counts = [_count([found[name, variant] for name in datasets], verdict) for variant in variants]
+        rows.append((f"{verdict} on", *counts))
+    unit = "percent less error" if metric == "mae" else "in its own unit"
+    caption = (
+        f"Improvement of the {METRICS[metric]}, the estimators' mean, over no augmentation ({unit}, positive is "
+        f"better), 95% interval and verdict, on every dataset. {analysis.results.setting.describe()}. Datasets of one "
+        "task share its policies, and their seeds are in their own tables."
+    )
+    return Table(f"overview-{metric}", caption, ("dataset", *variants), tuple(rows))
+
+
+def _count(found: Sequence[Finding | None], verdict: str) -> str:
+    """Return on how many of the datasets that were measured a verdict was given."""
+    measured = [each.improvement for each in found if each is not None and math.isfinite(each.improvement.value)]
+    return f"{sum(change.verdict == verdict for change in measured)} of {len(measured)}"
 
 
 def _verdict_text(found: Finding | None) -> str:

@@ -17,7 +17,7 @@ from oat_gym.benchmark.results import Results, Setting, cell_rows, estimate_rows
 from oat_gym.benchmark.scores import METRICS
 from oat_gym.benchmark.store import CellResult, read_result, write_result
 from oat_gym.benchmark.story import best_sentences, floor_sentence, groups_of, sentence
-from oat_gym.benchmark.tables import all_tables, dataset_table, help_table, paper_table, write_tables
+from oat_gym.benchmark.tables import all_tables, dataset_table, help_table, overview_table, paper_table, write_tables
 from oat_gym.errors import CacheError, ConfigurationError
 
 POLICIES = tuple(f"p{number}" for number in range(7))
@@ -197,6 +197,18 @@ def test_all_tables_are_written_and_hold_what_they_say(analysis: Analysis, tmp_p
     paths = write_tables(tables, tmp_path)
     assert (tmp_path / "tables.md") in paths
     assert "Table 3." in (tmp_path / "tables.md").read_text()
+
+
+def test_the_overview_has_every_dataset_and_counts_verdicts() -> None:
+    whole = results_of({"adroit-door-human": True, "line": True, "logs": False})
+    kept = tuple(part for part in whole.cells if (part.dataset, part.variant) != ("line", "scaling"))
+    table = overview_table(Analysis(Results(whole.setting, kept, whole.manifests, ())), "mae")
+    rows = {row[0]: dict(zip(table.header[1:], row[1:], strict=True)) for row in table.rows}
+    assert list(rows) == ["adroit-door-human", "line", "helps on", "hurts on"]
+    assert rows["line"]["oat-paper"].endswith(") helps") and rows["line"]["scaling"] == "-"
+    assert rows["helps on"] == {"oat-paper": "2 of 2", "jittering": "0 of 2", "scaling": "0 of 1"}
+    assert rows["hurts on"] == {"oat-paper": "0 of 2", "jittering": "0 of 2", "scaling": "1 of 1"}
+    assert overview_table(Analysis(results_of({"line": True})), "mae") is None
 
 
 def test_tidy_rows_keep_every_number(analysis: Analysis, tmp_path: Path) -> None:
