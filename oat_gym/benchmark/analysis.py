@@ -46,17 +46,19 @@ class Analysis:
     results: Results
     _cells: dict[tuple[str, str, str], dict[int, CellResult]] = field(init=False)
     _draws: dict[tuple[str, str, str, tuple[int, ...], Metric], Draws] = field(init=False)
+    _known: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         self._cells, self._draws = {}, {}
         for cell in self.results.cells:
             if not cell.failed:
                 self._cells.setdefault((cell.dataset, cell.variant, cell.family), {})[cell.seed] = cell
+        known = {cell.dataset for cell in self.results.cells if not cell.failed and cell.knows_truth}
+        self._known = tuple(name for name in self.results.datasets if name in known)
 
     def with_truth(self) -> tuple[str, ...]:
         """Return the datasets whose policies' true values are known."""
-        known = {cell.dataset for cell in self.results.cells if not cell.failed and cell.knows_truth}
-        return tuple(name for name in self.results.datasets if name in known)
+        return self._known
 
     def failed(self) -> tuple[str, ...]:
         """Return the datasets of which no cell was finished."""
