@@ -179,35 +179,34 @@ def help_table(analysis: Analysis, dataset: str, metric: Metric, *, baseline: st
 
 
 def overview_table(analysis: Analysis, metric: Metric) -> Table | None:
-    """Return the improvement of the mean over the estimators, a row for each dataset and a column for each variant.
+    """Return the improvement of the mean over the estimators, a row for each variant and a column for each dataset.
 
-    The last rows count the datasets on which a variant helps and hurts. None for one dataset, which has a table itself.
+    Before them: on how many datasets, of those with two seeds or more, a variant helps and hurts. None for one dataset,
+    which has a table itself.
     """
-    datasets, variants = analysis.with_truth(), [name for name in analysis.results.variants if name != NONE]
-    found = {
-        (dataset, variant): analysis.finding(dataset, variant, MEAN, metric)
-        for dataset in datasets
-        for variant in variants
-    }
-    if len(datasets) < 2 or not any(found.values()):
+    datasets = analysis.with_truth()
+    rows: list[tuple[str, ...]] = []
+    for variant in (name for name in analysis.results.variants if name != NONE):
+        found = [analysis.finding(dataset, variant, MEAN, metric) for dataset in datasets]
+        verdicts = [each.improvement.verdict for each in found if each is not None and each.improvement.n_seeds > 1]
+        counts = [f"{verdicts.count(verdict)} of {len(verdicts)}" for verdict in ("helps", "hurts")]
+        if any(each is not None for each in found):
+            rows.append((variant, *counts, *(_overview_text(each) for each in found)))
+    if len(datasets) < 2 or not rows:
         return None
-    rows = [(name, *(_verdict_text(found[name, variant]) for variant in variants)) for name in datasets]
-    for verdict in ("helps", "hurts"):
-        counts = [_count([found[name, variant] for name in datasets], verdict) for variant in variants]
-        rows.append((f"{verdict} on", *counts))
     unit = "percent less error" if metric == "mae" else "in its own unit"
     caption = (
         f"Improvement of the {METRICS[metric]}, the estimators' mean, over no augmentation ({unit}, positive is "
         f"better), 95% interval and verdict, on every dataset. {analysis.results.setting.describe()}. Datasets of one "
-        "task share its policies, and their seeds are in their own tables."
+        "task share its policies; the seeds of each are in its own table."
     )
-    return Table(f"overview-{metric}", caption, ("dataset", *variants), tuple(rows))
+    return Table(f"overview-{metric}", caption, ("variant", "helps on", "hurts on", *datasets), tuple(rows))
 
 
-def _count(found: Sequence[Finding | None], verdict: str) -> str:
-    """Return on how many of the datasets that were measured a verdict was given."""
-    measured = [each.improvement for each in found if each is not None and math.isfinite(each.improvement.value)]
-    return f"{sum(change.verdict == verdict for change in measured)} of {len(measured)}"
+def _overview_text(found: Finding | None) -> str:
+    if found is not None and found.improvement.n_seeds == 1 and math.isfinite(found.improvement.value):
+        return f"{format_number(found.improvement.value)} (one seed)"
+    return _verdict_text(found)
 
 
 def _verdict_text(found: Finding | None) -> str:
