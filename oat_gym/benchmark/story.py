@@ -162,6 +162,15 @@ def bars(analysis: Analysis, group: Group, *, family: str = MEAN, level: str | N
 
     `level` names the level of the paper's tables whose numbers are marked.
     """
+    panels = bar_panels(analysis, group, family=family, level=level)
+    if not panels:
+        return None
+    caption = f"Improvement over no augmentation, {group[0]}. Bars to the right are better; lines are 95% intervals."
+    return Picture.of(figures.improvement_bars(panels, title=group[0]), caption)
+
+
+def bar_panels(analysis: Analysis, group: Group, *, family: str, level: str | None) -> list[Panel]:
+    """Return what `bars` draws: a panel for each metric that was measured."""
     names = _measured(analysis, group)
     panels: list[Panel] = []
     for metric, title in METRICS.items():
@@ -170,11 +179,16 @@ def bars(analysis: Analysis, group: Group, *, family: str = MEAN, level: str | N
             continue
         changes = [None if each is None else each.improvement for each in found]
         marks = [math.nan if level is None else _paper_change(level, metric, name, group[1]) for name in names]
-        panels.append(Panel(title, UNITS[metric], names, changes, marks))
-    if not panels:
-        return None
-    caption = f"Improvement over no augmentation, {group[0]}. Bars to the right are better; lines are 95% intervals."
-    return Picture.of(figures.improvement_bars(panels, title=group[0]), caption)
+        labels = [_bar_label(name, each, group) for name, each in zip(names, found, strict=True)]
+        panels.append(Panel(title, UNITS[metric], labels, changes, marks))
+    return panels
+
+
+def _bar_label(variant: str, found: Finding | None, group: Group) -> str:
+    """Return a variant's name, with the number of datasets where that is not all of the group's."""
+    if found is None or len(found.datasets) == len(group[1]):
+        return variant
+    return f"{variant} ({len(found.datasets)} of {len(group[1])})"
 
 
 def _paper_change(level: str, metric: Metric, variant: str, datasets: Sequence[str]) -> float:
@@ -193,21 +207,35 @@ def _paper_change(level: str, metric: Metric, variant: str, datasets: Sequence[s
 
 
 def by_level(analysis: Analysis) -> Picture | None:
-    """Return the improvements by level of human involvement (figure 8); None unless two levels were measured."""
+    """Return the improvements by level of human involvement (figure 8) of variants that were measured at two or more.
+
+    None where there is no such variant.
+    """
     sets = {level: [adroit_dataset(analysis, level, task) for task in paper.TASKS] for level in paper.LEVELS}
     groups = {level: [name for name in names if name is not None] for level, names in sets.items()}
-    if sum(bool(names) for names in groups.values()) < 2:
+    panels = level_panels(analysis, groups)
+    if not panels:
         return None
+    title = "By level of human involvement (human: all by people; expert: none)"
+    levels = [_level_label(level, names) for level, names in groups.items()]
+    return Picture.of(figures.improvement_by_level(panels, levels=levels, title=title), title)
+
+
+def level_panels(
+    analysis: Analysis, groups: Mapping[str, Sequence[str]]
+) -> dict[str, dict[str, list[Improvement | None]]]:
+    """Return what `by_level` draws: metric -> variant -> its improvement on each level's datasets."""
     panels: dict[str, dict[str, list[Improvement | None]]] = {}
     for metric, title in METRICS.items():
-        panels[f"{title}: {UNITS[metric]}"] = {
+        changes = {
             variant: [_change(analysis.over(names, variant, MEAN, metric)) for names in groups.values()]
             for variant in analysis.results.variants
             if variant != NONE
         }
-    title = "By level of human involvement (human: all by people; expert: none)"
-    levels = [_level_label(level, names) for level, names in groups.items()]
-    return Picture.of(figures.improvement_by_level(panels, levels=levels, title=title), title)
+        compared = {name: found for name, found in changes.items() if sum(each is not None for each in found) > 1}
+        if compared:
+            panels[f"{title}: {UNITS[metric]}"] = compared
+    return panels
 
 
 def _level_label(level: str, names: Sequence[str]) -> str:

@@ -16,7 +16,15 @@ from oat_gym.benchmark.protocol import Question
 from oat_gym.benchmark.results import Results, Setting, cell_rows, estimate_rows, to_csv, write_tidy
 from oat_gym.benchmark.scores import METRICS
 from oat_gym.benchmark.store import CellResult, read_result, write_result
-from oat_gym.benchmark.story import best_sentences, floor_sentence, groups_of, sentence
+from oat_gym.benchmark.story import (
+    bar_panels,
+    best_sentences,
+    by_level,
+    floor_sentence,
+    groups_of,
+    level_panels,
+    sentence,
+)
 from oat_gym.benchmark.tables import all_tables, dataset_table, help_table, overview_table, paper_table, write_tables
 from oat_gym.errors import CacheError, ConfigurationError
 
@@ -264,6 +272,26 @@ def test_a_cell_comes_back_as_it_was_and_damage_is_seen(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(CacheError, match="damaged"):
         read_result(path)
+
+
+def test_pictures_name_what_was_measured_on_some_datasets_only() -> None:
+    levels = {f"adroit-{task}-{level}": True for task in ("pen", "door") for level in ("human", "expert")}
+    whole = results_of(levels)
+    kept = tuple(
+        part
+        for part in whole.cells
+        if (part.variant, part.dataset) != ("scaling", "adroit-pen-human")
+        and (part.variant, part.dataset.endswith("expert")) != ("jittering", True)
+    )
+    partial = Analysis(Results(whole.setting, kept, whole.manifests, ()))
+    (group, level), *_ = groups_of(partial)
+    panels = bar_panels(partial, group, family="mean", level=level)
+    assert all(panel.names == ["oat-paper", "jittering", "scaling (1 of 2)"] for panel in panels)
+    names = {level: [name for name in levels if name.endswith(level)] for level in ("human", "expert")}
+    found = level_panels(partial, names)  # jittering was tried at one level alone
+    assert found and all(list(panel) == ["oat-paper", "scaling"] for panel in found.values())
+    assert by_level(partial) is not None
+    assert by_level(Analysis(results_of({"adroit-door-human": True}))) is None
 
 
 def test_bars_draw_what_was_measured(analysis: Analysis) -> None:
