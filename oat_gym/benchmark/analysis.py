@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from oat_gym.benchmark.improvement import Improvement, improve, over_tasks
+from oat_gym.benchmark.improvement import Improvement, improve, over_related, over_tasks
 from oat_gym.benchmark.results import Results
 from oat_gym.benchmark.scores import METRICS, Draws, Metric, draw_scores, score
 from oat_gym.benchmark.store import CellResult
@@ -47,12 +47,14 @@ class Analysis:
     _cells: dict[tuple[str, str, str], dict[int, CellResult]] = field(init=False)
     _draws: dict[tuple[str, str, str, tuple[int, ...], Metric], Draws] = field(init=False)
     _known: tuple[str, ...] = field(init=False)
+    _tasks: dict[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
         self._cells, self._draws = {}, {}
         for cell in self.results.cells:
             if not cell.failed:
                 self._cells.setdefault((cell.dataset, cell.variant, cell.family), {})[cell.seed] = cell
+        self._tasks = {cell.dataset: cell.task for cell in self.results.cells}
         known = {cell.dataset for cell in self.results.cells if not cell.failed and cell.knows_truth}
         self._known = tuple(name for name in self.results.datasets if name in known)
 
@@ -112,6 +114,26 @@ class Analysis:
         families = tuple(dict.fromkeys(name for each in found for name in each.families))
         names = tuple(name for each in found for name in each.datasets)
         return Finding(names, variant, family, metric, mean, families)
+
+    def over_all(self, variant: str, family: str, metric: Metric, *, baseline: str = NONE) -> Finding | None:
+        """Return the mean over all tasks, each the mean of its datasets; None where no dataset has two seeds or more.
+
+        Datasets of one task share policies and may share episodes (`over_related`). Those of one seed are left out.
+        """
+        found = [
+            each
+            for name in self.with_truth()
+            if (each := self.finding(name, variant, family, metric, baseline=baseline)) is not None
+            and each.improvement.n_seeds > 1
+        ]
+        if not found:
+            return None
+        tasks: dict[str, list[Improvement]] = {}
+        for each in found:
+            tasks.setdefault(self._tasks[each.datasets[0]], []).append(each.improvement)
+        mean = over_tasks([over_related(members) for members in tasks.values()])
+        families = tuple(dict.fromkeys(name for each in found for name in each.families))
+        return Finding(tuple(each.datasets[0] for each in found), variant, family, metric, mean, families, baseline)
 
     def all_findings(self) -> Iterable[Finding]:
         """Give the improvements of every dataset with known truth, variant, family and "mean", and metric."""

@@ -39,7 +39,7 @@ on another sample is not in the interval: then, whatever the numbers, the verdic
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -179,18 +179,47 @@ def over_tasks(improvements: Sequence[Improvement], *, confidence: float = 0.95)
     Raises:
         InvalidDataError: for none, or different metrics.
     """
-    check_confidence(confidence)
+    members = _members(improvements)
+    parts = _sum_of_parts(members, math.fsum)
+    terms = [(each.parts.total / len(members) ** 2, each.degrees) for each in members]
+    return _mean(improvements[0].metric, members, parts, _satterthwaite(*terms, total=parts.total), confidence)
+
+
+def over_related(improvements: Sequence[Improvement], *, confidence: float = 0.95) -> Improvement:
+    """Return the mean of improvements that share policies or episodes, as those of one task's datasets do.
+
+    It has the widest interval that any correlation of theirs allows: standard errors add up and not variances, and the
+    fewest degrees of freedom count.
+
+    Raises:
+        InvalidDataError: for none, or different metrics.
+    """
+    members = _members(improvements)
+    parts = _sum_of_parts(members, lambda variances: sum(math.sqrt(each) for each in variances) ** 2)
+    degrees = min((each.degrees for each in members), default=math.nan)
+    return _mean(improvements[0].metric, members, parts, degrees, confidence)
+
+
+def _members(improvements: Sequence[Improvement]) -> list[Improvement]:
+    """Return the improvements that were measured."""
     if len({each.metric for each in improvements}) != 1:
-        raise InvalidDataError("The mean over tasks needs improvements of one metric, at least one.")
-    metric = improvements[0].metric
-    members = [each for each in improvements if math.isfinite(each.value)]
+        raise InvalidDataError("A mean needs improvements of one metric, at least one.")
+    return [each for each in improvements if math.isfinite(each.value)]
+
+
+def _sum_of_parts(members: Sequence[Improvement], add: Callable[[Sequence[float]], float]) -> Parts:
+    """Return the parts of the variance of a mean, each put together by `add`."""
+    size = max(len(members), 1)
+    sums = [add([float(getattr(each.parts, name)) for each in members]) / size**2 for name in _PARTS]
+    return Parts(sums[0], sums[1], sums[2], sums[3])
+
+
+def _mean(
+    metric: Metric, members: Sequence[Improvement], parts: Parts, degrees: float, confidence: float
+) -> Improvement:
+    check_confidence(confidence)
     if not members:
         return _nothing(metric, 0)
-    size = len(members)
-    sums = [sum(float(getattr(each.parts, name)) for each in members) / size**2 for name in _PARTS]
-    parts = Parts(sums[0], sums[1], sums[2], sums[3])
-    terms = [(each.parts.total / size**2, each.degrees) for each in members]
-    degrees = _satterthwaite(*terms, total=parts.total)
     effect, before, after = (
         float(np.mean([getattr(each, name) for each in members])) for name in ("effect", "before", "after")
     )

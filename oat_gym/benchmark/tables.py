@@ -71,7 +71,7 @@ def all_tables(analysis: Analysis) -> tuple[Table, ...]:
         for metric in RIVALRY
         for baseline in RIVALS
     ]
-    made += [overview_table(analysis, metric) for metric in RIVALRY]
+    made += [overview_table(analysis, metric, baseline=name) for metric in RIVALRY for name in (NONE, *RIVALS)]
     made.append(improvement_table(analysis))
     return tuple(table for table in made if table is not None)
 
@@ -178,29 +178,33 @@ def help_table(analysis: Analysis, dataset: str, metric: Metric, *, baseline: st
     return Table(name, caption, ("variant", "seeds", *columns), tuple(rows))
 
 
-def overview_table(analysis: Analysis, metric: Metric) -> Table | None:
+def overview_table(analysis: Analysis, metric: Metric, *, baseline: str = NONE) -> Table | None:
     """Return the improvement of the mean over the estimators, a row for each variant and a column for each dataset.
 
-    Before them: on how many datasets, of those with two seeds or more, a variant helps and hurts. None for one dataset,
-    which has a table itself.
+    Before them: the mean over all tasks (`Analysis.over_all`), and on how many datasets, of those with two seeds or
+    more, a variant helps and hurts. None for one dataset, which has a table itself.
     """
     datasets = analysis.with_truth()
     rows: list[tuple[str, ...]] = []
-    for variant in (name for name in analysis.results.variants if name != NONE):
-        found = [analysis.finding(dataset, variant, MEAN, metric) for dataset in datasets]
+    for variant in (name for name in analysis.results.variants if name not in (NONE, baseline)):
+        found = [analysis.finding(dataset, variant, MEAN, metric, baseline=baseline) for dataset in datasets]
         verdicts = [each.improvement.verdict for each in found if each is not None and each.improvement.n_seeds > 1]
         counts = [f"{verdicts.count(verdict)} of {len(verdicts)}" for verdict in ("helps", "hurts")]
         if any(each is not None for each in found):
-            rows.append((variant, *counts, *(_overview_text(each) for each in found)))
+            whole = _verdict_text(analysis.over_all(variant, MEAN, metric, baseline=baseline))
+            rows.append((variant, whole, *counts, *(_overview_text(each) for each in found)))
     if len(datasets) < 2 or not rows:
         return None
-    unit = "percent less error" if metric == "mae" else "in its own unit"
+    unit, plain = "percent less error" if metric == "mae" else "in its own unit", baseline == NONE
     caption = (
-        f"Improvement of the {METRICS[metric]}, the estimators' mean, over no augmentation ({unit}, positive is "
-        f"better), 95% interval and verdict, on every dataset. {analysis.results.setting.describe()}. Datasets of one "
-        "task share its policies; the seeds of each are in its own table."
+        f"Improvement of the {METRICS[metric]}, the estimators' mean, over {'no augmentation' if plain else baseline} "
+        f"({unit}, positive is better), 95% interval and verdict. {analysis.results.setting.describe()}. Over all: the "
+        "mean over tasks of two seeds or more; datasets of one task share its policies and count as one. The seeds of "
+        "each dataset are in its own table."
     )
-    return Table(f"overview-{metric}", caption, ("variant", "helps on", "hurts on", *datasets), tuple(rows))
+    words = ("helps on", "hurts on") if plain else ("better on", "worse on")
+    name = f"overview-{metric}" if plain else f"overview-against-{baseline}-{metric}"
+    return Table(name, caption, ("variant", "over all", *words, *datasets), tuple(rows))
 
 
 def _overview_text(found: Finding | None) -> str:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from oat_gym.benchmark.improvement import improve, over_tasks
+from oat_gym.benchmark.improvement import improve, over_related, over_tasks
 from oat_gym.benchmark.scores import METRICS, Draws, Metric, draw_scores, policy_picks, resampled_score, score
 from oat_gym.errors import InvalidDataError
 from oat_gym.ope import metrics
@@ -147,8 +147,13 @@ def test_the_mean_over_tasks_has_the_variance_of_a_mean() -> None:
     assert both.effect == pytest.approx(one.effect)
     assert both.standard_error == pytest.approx(one.standard_error / math.sqrt(2))
     assert both.degrees == pytest.approx(2 * one.degrees)
-    with pytest.raises(InvalidDataError, match="one metric"):
-        over_tasks([])
+    alike = over_related([one, one])  # the same twice is no more than once
+    assert alike.effect == pytest.approx(one.effect)
+    assert alike.standard_error == pytest.approx(one.standard_error)
+    assert alike.degrees == one.degrees and (alike.low, alike.high) == pytest.approx((one.low, one.high))
+    for mean in (over_tasks, over_related):
+        with pytest.raises(InvalidDataError, match="one metric"):
+            mean([])
     with pytest.raises(InvalidDataError, match="same estimators and seeds"):
         improve([], [], "mae", n_policies=2, n_episodes=2)
 

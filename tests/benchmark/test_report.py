@@ -217,13 +217,30 @@ def test_the_overview_has_every_dataset_and_counts_verdicts() -> None:
     )
     table = overview_table(Analysis(Results(whole.setting, kept, whole.manifests, ())), "mae")
     rows = {row[0]: dict(zip(table.header[1:], row[1:], strict=True)) for row in table.rows}
-    assert table.header == ("variant", "helps on", "hurts on", "adroit-door-human", "line")
+    assert table.header == ("variant", "over all", "helps on", "hurts on", "adroit-door-human", "line")
+    assert rows["scaling"]["over all"] == rows["scaling"]["adroit-door-human"]  # of the one that was measured
+    assert rows["jittering"]["over all"] == rows["jittering"]["adroit-door-human"]  # one seed does not count
     counts = {name: (row["helps on"], row["hurts on"]) for name, row in rows.items()}
     expected = {"oat-paper": ("2 of 2", "0 of 2"), "jittering": ("0 of 1", "0 of 1"), "scaling": ("0 of 1", "1 of 1")}
     assert counts == expected
     assert rows["oat-paper"]["line"].endswith(") helps") and rows["scaling"]["line"] == "-"
     assert rows["jittering"]["line"].endswith("(one seed)")
     assert overview_table(Analysis(results_of({"line": True})), "mae") is None
+    against = overview_table(Analysis(whole), "mae", baseline="oat-paper")
+    assert against.header[2:4] == ("better on", "worse on") and {row[0] for row in against.rows} == {
+        "jittering",
+        "scaling",
+    }
+    assert all(row[1].endswith(") worse") for row in against.rows)
+
+
+def test_datasets_of_one_task_count_as_one() -> None:
+    whole = Analysis(results_of({"adroit-door-human": True, "adroit-door-expert": True}))
+    one = whole.finding("adroit-door-human", "oat-paper", "mean", "mae").improvement
+    both = whole.over_all("oat-paper", "mean", "mae")
+    assert both.datasets == ("adroit-door-human", "adroit-door-expert")
+    assert both.improvement.standard_error == pytest.approx(one.standard_error)
+    assert whole.over_all("oat", "mean", "mae") is None
 
 
 def test_tidy_rows_keep_every_number(analysis: Analysis, tmp_path: Path) -> None:
