@@ -27,7 +27,8 @@ freedom (1946)
 so that three seeds alone give the wide quantile 4.30 and not 1.96, where seeds are what varies. Seeds and policies are
 crossed, and what they do together is counted in both terms: the interval is slightly too wide, never too narrow for
 that reason (Owen, 2007, "The pigeonhole bootstrap"). Tasks are independent: variances add, divided by their number
-squared. `tests/benchmark/test_improvement.py` has the coverage.
+squared. Datasets of one task are not, they share its policies: standard errors add, divided by their number.
+`tests/benchmark/test_improvement.py` has the coverage.
 
 The sum of the terms is cautious: where a method changes nothing, less than 1% of the 95% intervals exclude zero in that
 file's experiments and not 5%, so that "no evidence" is also said of some changes that are there.
