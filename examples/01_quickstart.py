@@ -19,7 +19,6 @@ config = OAT(
     model=VAEMDPConfig(max_updates=50),
     behavior=BehaviorConfig(max_updates=200),
     features=("achieved_goal",),
-    start="posterior",
 )
 data = oat_gym.AugmentedDataset(real, config, factor=3, seed=0)
 print(f"{len(data)} episodes and {data.total_steps} steps, before any training")

@@ -26,21 +26,24 @@ from oat_gym.source import Source
 class OAT(StitchingAugmenter):
     """Offline policy evaluation with augmented trajectories (paper, section 2).
 
+    The defaults are the form whose generated steps are nearest to recorded ones and that estimated best of those tried
+    (tests/benchmarks/results/benchmark); `OAT.preset("paper")` is the paper's.
+
     Args:
         mining: TICC, support and PST sets (section 2.1); by default the number of clusters by silhouette, W = 20 and
             the set of the highest support.
         model: the VAE-MDP of each set (section 2.2, Eq. 1) and its training.
         behavior: the clone of the behaviour policy that acts in the roll-outs.
-        start: where a roll-out starts: z_1 from the "prior" N(0, I), as in the paper, or from the "posterior"
-            q(z_1|s_1) of the span that it replaces.
+        start: where a roll-out starts: z_1 from the "posterior" q(z_1|s_1) of the span that it replaces, or from the
+            "prior" N(0, I), as in the paper.
         actions: "behavior": sampled from the cloned policy, as in the paper; "recorded": those of the span replaced.
         policy: acts in the roll-outs in place of the clone, on batches of the dataset's spaces: an object with
             `sample(observations, *, rng)` and `log_prob(observations, actions)`. The result is not kept in the cache,
             since a policy has no fingerprint.
-        observation_noise: draw states and rewards from their distributions, as in the paper, or (false) take their
-            means: smoother states, since the paper's diagonal Gaussian p(s|z) adds independent noise to every step.
-        seam: "contiguous" (Minari's form), "literal" (the paper's: tuples outside the span keep their own next state,
-            visible in `transitions()`), or "matched" (of `candidates` samples the one with the least seam jump).
+        observation_noise: take the means of states and rewards (false), or draw them from their distributions, as in
+            the paper, whose diagonal Gaussian p(s|z) adds independent noise to every step.
+        seam: "matched" (of `candidates` samples the one with the least seam jump), "contiguous" (the first sample), or
+            "literal" (the paper's: tuples outside the span keep their own next state, visible in `transitions()`).
         candidates: how many samples "matched" chooses from.
         ends: "recorded": no span holds the step in which an episode terminates, so that episodes end as they did, with
             their own last reward; "generated": one may, as in the paper, where nothing models terminations and an

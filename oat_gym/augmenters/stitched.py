@@ -19,6 +19,7 @@ from oat_gym.augmenters.generative import (
     GenerativeSampler,
     Learned,
     Matrices,
+    Start,
     check_choice,
     with_prefix,
 )
@@ -33,6 +34,8 @@ from oat_gym.spaces import Batch, map_tree
 from oat_gym.stitching import Seam, Span, literal_next_states, stitch_into, stitchable_copy
 
 FloatArray = npt.NDArray[np.float64]
+_AT_ONCE = 8192
+"""Samples that are rolled out together, which bounds the memory of a large dataset's."""
 Actions = Literal["behavior", "recorded"]
 Ends = Literal["generated", "recorded"]
 Rewards = Literal["modelled", "recorded"]
@@ -42,8 +45,10 @@ Rewards = Literal["modelled", "recorded"]
 class StitchingAugmenter(GenerativeAugmenter):
     """The settings of a method that replaces windows of episodes by samples; `OAT` says what they mean."""
 
+    start: Start = "posterior"
+    observation_noise: bool = False
     actions: Actions = "behavior"
-    seam: Seam = "contiguous"
+    seam: Seam = "matched"
     candidates: int = 16
     ends: Ends = "recorded"
     rewards: Rewards = "modelled"
@@ -75,10 +80,14 @@ class StitchingAugmenter(GenerativeAugmenter):
 
     @classmethod
     def preset(cls, preset: Literal["default", "paper"]) -> Self:
-        """Return a named configuration: "default", or "paper" (appendix B.2: 100 updates of 4 spans, literal seams)."""
+        """Return a named configuration: "default", or "paper" (section 2.2 and appendix B.2).
+
+        The paper's: 100 updates of 4 spans, roll-outs from the prior, noisy steps, literal seams, generated ends.
+        """
         if preset == "default":
             return cls()
-        return cls(model=VAEMDPConfig.from_preset(preset), seam="literal", ends="generated")
+        model = VAEMDPConfig.from_preset(preset)
+        return cls(model=model, start="prior", observation_noise=True, seam="literal", ends="generated")
 
 
 @dataclass(frozen=True)
@@ -175,15 +184,21 @@ class StitchedSampler(GenerativeSampler):
         return arrays
 
     def _roll_out(self, g: int, k: int, rows: list[Occurrence]) -> Arrays:
+        repeats = self._config.candidates if self._config.seam == "matched" else 1
+        size, rng = max(1, _AT_ONCE // repeats), derive(self._seed, "sample", g, k)
+        parts = [self._sample(g, rows[at : at + size], repeats=repeats, rng=rng) for at in range(0, len(rows), size)]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _sample(self, g: int, rows: list[Occurrence], *, repeats: int, rng: np.random.Generator) -> Arrays:
+        """Roll out `repeats` samples for each of some spans and keep the one whose seams jump least."""
         config, data, width = self._config, self._data, self.windows.length
         recorded = np.stack([data.states[i][start : start + width + 1] for i, start in rows])
-        repeats = config.candidates if config.seam == "matched" else 1
         actions = None
         if config.actions == "recorded":
             actions = np.stack([data.actions[i][start : start + width] for i, start in rows]).repeat(repeats, axis=0)
         samples = self._learned.models[g].sample(
             len(rows) * repeats,
-            rng=derive(self._seed, "sample", g, k),
+            rng=rng,
             policy=self._policy,
             limits=self._limits,
             actions=actions,

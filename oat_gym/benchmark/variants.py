@@ -98,6 +98,11 @@ def _baseline(name: str, paper: str) -> Variant:
 
 
 _MANY = MiningConfig(n_clusters="auto", top=20)
+_PRIOR = OAT(start="prior", seam="contiguous", observation_noise=True)
+"""OAT where the paper says how a roll-out starts, what it draws and which sample is taken."""
+_POSTERIOR = replace(_PRIOR, start="posterior")
+_MATCHED = replace(_POSTERIOR, seam="matched")
+_RANDOM = TDA(start="prior", seam="contiguous", observation_noise=True, ends="generated")
 
 VARIANTS: dict[str, Variant] = {
     variant.name: variant
@@ -113,68 +118,68 @@ VARIANTS: dict[str, Variant] = {
         _baseline("permutation", "Permutation"),
         _baseline("jittering", "Jittering"),
         _baseline("scaling", "Scaling"),
-        Variant("tda", TDA(ends="generated"), paper="TDA", note="TDA: windows anywhere, ends of episodes included"),
+        Variant("tda", _RANDOM, paper="TDA", note="TDA: windows anywhere, ends of episodes included"),
+        Variant(
+            "oat-prior",
+            _PRIOR,
+            use_augmented=None,
+            note="OAT with roll-outs from the prior, one sample a span and noisy steps",
+        ),
         Variant(
             "oat-posterior",
-            OAT(start="posterior"),
+            _POSTERIOR,
             use_augmented=None,
-            note="roll-outs start where the span that they replace starts",
+            note="as oat-prior, roll-outs start where the span that they replace starts",
         ),
         Variant(
             "oat-matched",
-            OAT(start="posterior", seam="matched"),
+            _MATCHED,
             use_augmented=None,
             note="as oat-posterior, the best of several samples at the seams",
         ),
         Variant(
-            "oat-smooth",
-            OAT(start="posterior", seam="matched", observation_noise=False),
-            use_augmented=None,
-            note="as oat-matched, mean states and rewards in place of noisy ones",
-        ),
-        Variant(
             "oat-many",
-            OAT(mining=_MANY, start="posterior", seam="matched"),
+            replace(_MATCHED, mining=_MANY),
             use_augmented=None,
             note="as oat-matched, 20 sets of sub-trajectories in place of one",
         ),
         Variant(
             "oat-recorded",
-            OAT(mining=_MANY, start="posterior", actions="recorded"),
+            replace(_POSTERIOR, mining=_MANY, actions="recorded"),
             use_augmented=None,
             note="20 sets, the recorded actions replayed in the model",
         ),
         Variant(
             "oat-targets",
-            OAT(mining=_MANY, start="posterior", seam="matched"),
+            replace(_MATCHED, mining=_MANY),
             use_augmented=None,
             targets=True,
             note="as oat-many, and the target policies act in the model in place of the clone",
         ),
         Variant(
             "oat-light",
-            OAT(start="posterior", seam="matched"),
+            _MATCHED,
             factor=2,
             use_augmented=None,
             note="as oat-matched, one synthetic episode for each real one: synthetic steps weigh half",
         ),
         Variant(
             "oat-cut",
-            OAT(ends="generated"),
+            replace(_PRIOR, ends="generated"),
             use_augmented=None,
-            note="as oat, and spans may hold the step in which an episode terminates, as in the paper",
+            note="as oat-prior, and spans may hold the step in which an episode terminates, as in the paper",
         ),
         Variant(
             "oat-kept",
-            OAT(start="posterior", seam="matched", observation_noise=False, rewards="recorded"),
+            OAT(rewards="recorded"),
             use_augmented=None,
-            note="as oat-smooth, with rewards that the data holds",
+            note="as oat, with rewards that the data holds",
         ),
         Variant(
             "oat-jitter",
-            Compose((OAT(start="posterior", seam="matched", observation_noise=False), Jittering())),
+            Compose((OAT(), Jittering())),
             use_augmented=None,
-            note="as oat-smooth, then jittering: regularisation by noise of one size everywhere",
+            note="as oat, then jittering: regularisation by noise of one size everywhere",
         ),
     )
 }

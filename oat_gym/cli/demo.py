@@ -25,10 +25,9 @@ DEMO_ID = "maze2d-umaze/oat-v0"
 DEMO_CONFIG = OAT(
     mining=MiningConfig(n_clusters="auto", candidates=tuple(range(4, 11)), switch_penalty=20.0, top=3),
     model=VAEMDPConfig(max_updates=600),
-    start="posterior",
     features=("achieved_goal",),
 )
-"""Three PST sets, as in the paper's Fig. 4, of clusters of places in the maze; roll-outs start where the span does."""
+"""Three PST sets, as in the paper's Fig. 4, of clusters of places in the maze."""
 
 
 def demo(

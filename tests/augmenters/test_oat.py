@@ -12,10 +12,13 @@ from minari.data_collector import EpisodeBuffer
 
 import oat_gym
 from oat_gym import OAT, AugmentedDataset, MiningConfig
+from oat_gym.augmenters import stitched
 from oat_gym.episodes import content_hash
 from oat_gym.errors import AugmentationWarning, ConfigurationError, InvalidDataError, UnsupportedSpaceError
 from oat_gym.generation import BehaviorConfig, VAEMDPConfig
+from oat_gym.generation.sampling import FittedVAEMDP
 from oat_gym.mining import count_tdss
+from oat_gym.source import Source
 from tests.conftest import install_dataset, walks
 
 
@@ -102,7 +105,7 @@ print(content_hash(episodes[i] for i in range(48)))
 
 
 def test_literal_seams_show_in_transitions_only(walk_dataset: minari.MinariDataset, tiny_oat: OAT) -> None:
-    contiguous = AugmentedDataset(walk_dataset, tiny_oat, factor=2)
+    contiguous = AugmentedDataset(walk_dataset, dataclasses.replace(tiny_oat, seam="contiguous"), factor=2)
     literal = AugmentedDataset(walk_dataset, dataclasses.replace(tiny_oat, seam="literal"), factor=2)
     assert content_hash(literal) == content_hash(contiguous)
     a, b = contiguous.transitions(), literal.transitions()
@@ -124,10 +127,31 @@ def test_literal_seams_show_in_transitions_only(walk_dataset: minari.MinariDatas
 
 def test_matched_seams_jump_less(walk_dataset: minari.MinariDataset, tiny_oat: OAT) -> None:
     def mean_jump(seam: str) -> float:
-        data = AugmentedDataset(walk_dataset, dataclasses.replace(tiny_oat, seam=seam), factor=3)
+        form = dataclasses.replace(tiny_oat, start="prior", observation_noise=True, seam=seam)
+        data = AugmentedDataset(walk_dataset, form, factor=3)
         return float(np.mean([sum(span.seam) for i in range(12, 36) for span in data.provenance(i).spans]))
 
     assert mean_jump("matched") < 0.7 * mean_jump("contiguous")
+
+
+def test_many_samples_are_rolled_out_in_parts(
+    walk_dataset: minari.MinariDataset, tiny_oat: OAT, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sampler = tiny_oat.fit(Source(walk_dataset), seed=0)
+    sizes: list[int] = []
+    drawn = FittedVAEMDP.sample
+    monkeypatch.setattr(FittedVAEMDP, "sample", lambda self, n, **rest: sizes.append(n) or drawn(self, n, **rest))
+    whole = sampler.generate(1)
+    n_spans = len(whole["0/rows"])
+    assert sizes[0] == n_spans * tiny_oat.candidates and n_spans > 4
+    calls = len(sizes)  # one a set
+    monkeypatch.setattr(stitched, "_AT_ONCE", 4 * tiny_oat.candidates)
+    parts = sampler.generate(1)
+    assert max(sizes[calls:]) == 4 * tiny_oat.candidates and sum(sizes[calls:]) == sum(sizes[:calls])
+    assert {name: array.shape for name, array in parts.items()} == {name: array.shape for name, array in whole.items()}
+    np.testing.assert_array_equal(parts["0/rows"], whole["0/rows"])
+    assert len(np.unique(parts["0/actions"].reshape(n_spans, -1), axis=0)) == n_spans
+    assert parts["0/seams"].mean() < 1.5 * whole["0/seams"].mean()  # each sample is in the place of its own span
 
 
 def test_recorded_actions_are_kept(walk_dataset: minari.MinariDataset, tiny_oat: OAT) -> None:
@@ -235,7 +259,10 @@ def test_bad_settings_are_named(settings: dict[str, object]) -> None:
 
 def test_presets_and_repr() -> None:
     paper = OAT.preset("paper")
-    assert paper.seam == "literal"
+    assert (paper.start, paper.observation_noise, paper.seam, paper.ends) == ("prior", True, "literal", "generated")
+    default = OAT()
+    assert OAT.preset("default") == default
+    assert (default.start, default.observation_noise, default.seam) == ("posterior", False, "matched")
     assert paper.model == VAEMDPConfig.from_preset("paper")
     names = {"OAT": OAT, "MiningConfig": MiningConfig, "VAEMDPConfig": VAEMDPConfig}
     names["BehaviorConfig"] = type(paper.behavior)
