@@ -115,15 +115,25 @@ class Analysis:
         names = tuple(name for each in found for name in each.datasets)
         return Finding(names, variant, family, metric, mean, families)
 
-    def over_all(self, variant: str, family: str, metric: Metric, *, baseline: str = NONE) -> Finding | None:
+    def over_all(
+        self,
+        variant: str,
+        family: str,
+        metric: Metric,
+        *,
+        baseline: str = NONE,
+        datasets: Sequence[str] | None = None,
+    ) -> Finding | None:
         """Return the mean over all tasks, each the mean of its datasets; None where no dataset has two seeds or more.
 
         Datasets of one task share policies and may share episodes (`over_related`). Those of one seed are left out.
+        `datasets` takes some datasets alone.
         """
         found = [
             each
             for name in self.with_truth()
-            if (each := self.finding(name, variant, family, metric, baseline=baseline)) is not None
+            if (datasets is None or name in datasets)
+            and (each := self.finding(name, variant, family, metric, baseline=baseline)) is not None
             and each.improvement.n_seeds > 1
         ]
         if not found:

@@ -241,6 +241,8 @@ def test_datasets_of_one_task_count_as_one() -> None:
     assert both.datasets == ("adroit-door-human", "adroit-door-expert")
     assert both.improvement.standard_error == pytest.approx(one.standard_error)
     assert whole.over_all("oat", "mean", "mae") is None
+    some = whole.over_all("oat-paper", "FQE", "mae", datasets=["adroit-door-expert"])
+    assert some.improvement == whole.finding("adroit-door-expert", "oat-paper", "FQE", "mae").improvement
 
 
 def test_tidy_rows_keep_every_number(analysis: Analysis, tmp_path: Path) -> None:
