@@ -46,7 +46,7 @@ class VAE(Augmenter):
         model: the network and its training.
         start: z from the "prior" N(0, I), or from the "posterior" q(z|x) of the source episode, which gives variations
             of that episode rather than new ones.
-        observation_noise: draw rows from p(x|z), as OAT does by default, so that spreads are those of the data; if
+        observation_noise: draw rows from p(x|z), so that spreads are those of the data, as OAT's paper does; if
             false, take means and most likely categories: smoother, less varied series.
 
     Raises:

@@ -46,7 +46,8 @@ class VAEMDP(GenerativeAugmenter):
 
     Args:
         candidates: roll-outs that each variation is drawn from; 1 takes any. No effect where no episode terminates.
-        model: see `OAT`, as `behavior`, `start`, `policy` and `observation_noise`. Training takes time in proportion
+        model: see `OAT`, as `behavior`, `start`, `policy` and `observation_noise`, of which the last three are the
+            paper's by default (the prior, the clone, with noise). Training takes time in proportion
             to the longest trajectory, so the default is 500 updates, patience 100, in place of OAT's 1000 and 200: on
             the door demonstrations (25 of 222 to 299 steps) about 150 CPU seconds, with the best held-out ELBO at
             440 updates and little gain after 300.
