@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import shutil
+import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -18,7 +19,7 @@ from oat_gym.augmenters import Augmenter
 from oat_gym.augmenters.oat import OAT
 from oat_gym.cache import canonical
 from oat_gym.episodes import Transitions, collect_transitions
-from oat_gym.errors import ConfigurationError, InvalidDataError
+from oat_gym.errors import AugmentationWarning, ConfigurationError, InvalidDataError
 from oat_gym.export import (
     DATA_FORMATS,
     DataFormat,
@@ -30,7 +31,7 @@ from oat_gym.export import (
 from oat_gym.io.d4rl import is_d4rl_path, read_d4rl
 from oat_gym.mining import MiningResult
 from oat_gym.progress import ProgressCallback
-from oat_gym.provenance import Provenance
+from oat_gym.provenance import Provenance, renumbered
 from oat_gym.recipe import (
     APPENDED,
     EPISODE_METADATA_FILE,
@@ -206,8 +207,9 @@ class AugmentedDataset(MinariDataset):
         """Store this dataset (or this view) under `dataset_id` among Minari's local datasets and return it opened.
 
         HDF5 stores exactly what is iterated. Arrow and Parquet hold infos of T+1 rows only: infos of T rows get a copy
-        of their first row before them there, and the episode's metadata has `infos_rows` = T; integer rewards become
-        floats.
+        of their first row before them there, and the episode's metadata has `infos_rows` = T; integers recorded for
+        real numbers (rewards, spaces of floats) become floats. Literal seams keep their own next states in a recipe
+        only: a warning tells of them.
 
         Args:
             dataset_id: (namespace/)name-v(version), free.
@@ -228,18 +230,29 @@ class AugmentedDataset(MinariDataset):
             return self._save_recipe(dataset_id, mark_steps=mark_steps)
         for number, length in enumerate(self.storage.lengths(self.episode_indices)):
             check_length(number, int(length), data_format)
+        self._warn_of_lost_seams()
         like = source_metadata(self) | {"oat_gym": self.description()}
+        metadata = self.storage.get_episode_metadata(self.episode_indices)
         with new_dataset_folder(dataset_id) as data_path:
             write_dataset(
                 data_path,
                 dataset_id,
-                zip(self.iterate_episodes(), self.storage.get_episode_metadata(self.episode_indices), strict=True),
+                zip(self.iterate_episodes(), renumbered(metadata, self.episode_indices), strict=True),
                 like=like,
                 spaces=(self.observation_space, self.action_space),
                 data_format=data_format,
                 step_mask=_mask_of if mark_steps else None,
             )
         return find_dataset(dataset_id)
+
+    def _warn_of_lost_seams(self) -> None:
+        if any(self.storage.next_states(int(number)) for number in self.episode_indices):
+            warnings.warn(
+                "Transitions at literal seams have next states of their own, which Minari's formats cannot hold: the "
+                "saved dataset will have observations[t+1] there. Save with lazy=True, or read transitions().",
+                AugmentationWarning,
+                stacklevel=3,
+            )
 
     def _save_recipe(self, dataset_id: str, *, mark_steps: bool) -> MinariDataset:
         if mark_steps:
@@ -273,9 +286,8 @@ class AugmentedDataset(MinariDataset):
     def _transition_parts(self, number: int) -> tuple[EpisodeData, Any, dict[int, Any]]:
         variation = self.storage.variation(number)
         mask = self.storage.provenance(number, variation).mask
-        if variation is None:
-            return next(self.iterate_episodes([number])), mask, {}
-        return variation.episode, mask, variation.next_states
+        episode = next(self.iterate_episodes([number])) if variation is None else variation.episode
+        return episode, mask, self.storage.next_states(number, variation)
 
     def __repr__(self) -> str:
         plan = self.synthesis

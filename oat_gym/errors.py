@@ -46,7 +46,7 @@ class SourceChangedError(OatGymError, RuntimeError):
 
 
 class AugmentationWarning(UserWarning):
-    """The augmented dataset is sound, but less was generated than its size suggests."""
+    """The augmented dataset is sound, but holds less than expected: fewer generated steps, or seams that were lost."""
 
 
 class EstimationWarning(UserWarning):

@@ -26,7 +26,7 @@ from oat_gym.cache import write_atomically
 from oat_gym.episodes import plain_infos
 from oat_gym.errors import ConfigurationError, DatasetExistsError, InvalidDataError, OatGymError, SaveError
 from oat_gym.serialization import metadata_to_json
-from oat_gym.spaces import map_tree, tree_length
+from oat_gym.spaces import in_kind_of, map_tree, tree_length
 
 DataFormat = Literal["hdf5", "arrow", "parquet"]
 DATA_FORMATS: tuple[DataFormat, ...] = ("hdf5", "arrow", "parquet")
@@ -136,7 +136,8 @@ def write_dataset(
 
     Minari's Arrow and Parquet storage takes infos of T+1 rows only (a row of the reset, then those of the steps).
     Infos of T rows get a copy of their first row before them there, and the episode's metadata says so:
-    `infos_rows` is then T, the number of the last rows that were recorded. Integer rewards become floats there.
+    `infos_rows` is then T, the number of the last rows that were recorded. Integer rewards become floats there, and
+    observations and actions of another kind of number than their space get its dtype.
 
     Args:
         data_path: the dataset's `data` folder.
@@ -169,7 +170,7 @@ def write_dataset(
             mask = None if step_mask is None else step_mask(metadata)
             padded = INFOS_ROWS in metadata or (for_arrow and _has_leaf_of(episode.infos, length))
             kept.append(metadata | {INFOS_ROWS: length} if padded else metadata)
-            yield _buffer(number, episode, mask, for_arrow=for_arrow)
+            yield _buffer(number, episode, mask, spaces=spaces, for_arrow=for_arrow)
 
     with _size_known_later(storage):
         for batch, size in _batches(buffers()):
@@ -247,7 +248,7 @@ def _unsupported_is_fine() -> Generator[None]:
             raise
 
 
-def _buffer(number: int, episode: EpisodeData, mask: Any, *, for_arrow: bool) -> EpisodeBuffer:
+def _buffer(number: int, episode: EpisodeData, mask: Any, *, spaces: tuple[Any, Any], for_arrow: bool) -> EpisodeBuffer:
     infos: dict[str, Any] | None = plain_infos(episode.infos)
     if mask is not None:
         # Infos have T+1 rows where the environment's reset gave one, else T: the mask takes the same form.
@@ -255,14 +256,16 @@ def _buffer(number: int, episode: EpisodeData, mask: Any, *, for_arrow: bool) ->
         infos = {**(infos or {}), "synthetic": np.concatenate([np.zeros(rows - len(mask), dtype=bool), mask])}
     if infos and for_arrow:
         infos = map_tree(lambda leaf: _arrow_info(leaf, len(episode.rewards)), infos)
-    # Arrow reads all episodes as one table, and generated rewards are floats where recorded ones may be integers.
-    rewards = (
-        episode.rewards.astype(np.float64) if for_arrow and episode.rewards.dtype.kind in "biu" else episode.rewards
-    )
+    observations, actions, rewards = episode.observations, episode.actions, episode.rewards
+    if (
+        for_arrow
+    ):  # it reads all episodes as one table, and recorded numbers may be integers where generated ones are not
+        observations, actions = in_kind_of(spaces[0], observations), in_kind_of(spaces[1], actions)
+        rewards = rewards.astype(np.float64) if rewards.dtype.kind in "biu" else rewards
     return EpisodeBuffer(
         id=number,
-        observations=episode.observations,
-        actions=episode.actions,
+        observations=observations,
+        actions=actions,
         rewards=rewards,  # pyright: ignore[reportArgumentType]  (Minari takes arrays as well as lists)
         terminations=episode.terminations,  # pyright: ignore[reportArgumentType]
         truncations=episode.truncations,  # pyright: ignore[reportArgumentType]

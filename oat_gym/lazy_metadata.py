@@ -36,7 +36,7 @@ class LazyMetadata(dict[str, Any]):
         if self._rest is not None:
             rest, self._rest = self._rest, None
             for key, value in rest().items():
-                self.setdefault(key, value)
+                super().setdefault(key, value)
         return self
 
     def __missing__(self, key: str) -> Any:
@@ -56,13 +56,22 @@ class LazyMetadata(dict[str, Any]):
     def __eq__(self, other: object) -> bool:
         return super(LazyMetadata, self.complete()).__eq__(other)
 
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
     __hash__ = None  # pyright: ignore[reportAssignmentType]  (as of every dict)
+
+    def __reversed__(self) -> Iterator[str]:
+        return super(LazyMetadata, self.complete()).__reversed__()
 
     def __repr__(self) -> str:
         return super(LazyMetadata, self.complete()).__repr__()
 
     def __or__(self, other: Any) -> dict[str, Any]:
         return dict(self.items()) | other
+
+    def __ror__(self, other: Any) -> dict[str, Any]:
+        return other | dict(self.items())
 
     def __reduce__(self) -> tuple[Any, ...]:
         return dict, (dict(self.items()),)
@@ -73,6 +82,18 @@ class LazyMetadata(dict[str, Any]):
             return self[key]
         except KeyError:
             return default
+
+    def pop(self, key: str, *default: Any) -> Any:
+        """Remove `key` and return its value, or `default` where it is not there."""
+        return super(LazyMetadata, self.complete()).pop(key, *default)
+
+    def popitem(self) -> tuple[str, Any]:
+        """Remove and return the last (key, value) pair."""
+        return super(LazyMetadata, self.complete()).popitem()
+
+    def setdefault(self, key: str, default: Any = None) -> Any:
+        """Return the value of `key`, which becomes `default` where it is not there."""
+        return super(LazyMetadata, self.complete()).setdefault(key, default)
 
     def keys(self) -> Any:
         """Return the keys."""

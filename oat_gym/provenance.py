@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from oat_gym.episodes import BoolArray
 from oat_gym.lazy_metadata import LazyMetadata
@@ -20,9 +21,9 @@ METADATA_KEYS = ("synthetic", "source", "variation", "spans", "pst_sets", "sampl
 class Provenance:
     """The origin of one episode.
 
-    `source` is the number, in the same dataset, of the episode it was made from (itself where it is real; -1 where
-    that episode is not in the dataset, because a view was augmented), `variation` the number of the variation (None
-    where it is real), `spans` the generated steps, `length` its number of steps T.
+    `source` is the id (`episode.id`) of the episode it was made from, itself where it is real; -1 where that episode is
+    not in the dataset, because a view was augmented or saved. A view has the ids of the whole. `variation` is the
+    number of the variation (None where it is real), `spans` the generated steps, `length` its number of steps T.
 
     >>> Provenance(synthetic=True, source=3, variation=0, spans=(Span(1, 3),), length=4).mask.tolist()
     [False, True, True, False]
@@ -77,6 +78,17 @@ class Provenance:
 def has_provenance(metadata: Mapping[str, Any]) -> bool:
     """Whether episode metadata holds a provenance: all our keys, since users have keys called "source" too."""
     return isinstance(metadata, LazyMetadata) or all(key in metadata for key in METADATA_KEYS)
+
+
+def renumbered(metadata: Iterable[Mapping[str, Any]], ids: npt.NDArray[np.integer[Any]]) -> Iterator[dict[str, Any]]:
+    """Yield the metadata of the episodes `ids` with sources that are places among them, for a copy that counts anew."""
+    places = {int(number): place for place, number in reversed(list(enumerate(ids)))}
+    for place, part in enumerate(metadata):
+        if not has_provenance(part):
+            yield dict(part)
+            continue
+        source = places.get(int(part["source"]), -1) if part["synthetic"] else place
+        yield dict(part) | {"source": source}
 
 
 def merge_spans(old: tuple[Span, ...], new: tuple[Span, ...], *, length: int) -> tuple[Span, ...]:

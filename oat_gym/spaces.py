@@ -176,6 +176,20 @@ def in_dtype_of(recorded: npt.NDArray[Any], made: npt.NDArray[Any]) -> npt.NDArr
     return made.astype(recorded.dtype if np.can_cast(made.dtype, recorded.dtype, "same_kind") else made.dtype)
 
 
+def in_kind_of(space: spaces.Space[Any], batch: Batch) -> Batch:
+    """Return a batch without integers that are recorded for a space of real numbers, or booleans for one of integers.
+
+    What is generated for such a space is of its dtype, and storages that keep one column for all need one dtype.
+    """
+    if isinstance(space, spaces.Dict):
+        return {key: in_kind_of(space.spaces[key], part) for key, part in batch.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(in_kind_of(child, part) for child, part in zip(space.spaces, batch, strict=True))
+    kinds = {"f": "biu", "i": "b", "u": "b"}.get(np.dtype(space.dtype).kind, "")
+    cast = isinstance(batch, np.ndarray) and batch.dtype.kind in kinds
+    return batch.astype(space.dtype) if cast else batch
+
+
 def copy_tree(batch: Batch) -> Batch:
     """Return a copy that shares no memory with `batch`."""
     return map_tree(_copy_leaf, batch)

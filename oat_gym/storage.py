@@ -12,11 +12,9 @@ import dataclasses
 import itertools
 import json
 import logging
-import os
 import pathlib
 import shutil
 import tempfile
-import weakref
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -28,6 +26,7 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset._storages import _registry  # pyright: ignore[reportPrivateUsage]
 from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
 
+from oat_gym._live import LIVE, attach
 from oat_gym._staging import owned_folder
 from oat_gym.augmenters.base import Variation
 from oat_gym.cache import write_atomically
@@ -48,12 +47,10 @@ from oat_gym.recipe import (
 )
 from oat_gym.serialization import metadata_to_json
 from oat_gym.source import Source
+from oat_gym.spaces import Batch
 from oat_gym.synthesis import Synthesis
 
 _log = logging.getLogger(__name__)
-
-# Minari re-opens a dataset by its path (split_dataset, spec.data_path): within a process the same plan answers.
-_live: weakref.WeakValueDictionary[str, Synthesis] = weakref.WeakValueDictionary()
 
 
 class AugmentedStorage(MinariStorage):
@@ -73,7 +70,7 @@ class AugmentedStorage(MinariStorage):
         jpeg_encoding: bool = True,
     ) -> None:
         super().__init__(pathlib.Path(data_path), observation_space, action_space, jpeg_encoding)
-        live = _live.get(str(data_path))
+        live = LIVE.get(str(data_path))
         self.synthesis = live or open_recipe(self.data_path)
         if self.synthesis is not None:
             source_format = self.synthesis.source.dataset.storage.FORMAT
@@ -88,7 +85,7 @@ class AugmentedStorage(MinariStorage):
         path = owned_folder("oat_gym-", pathlib.Path(tempfile.gettempdir()))
         write_metadata(path, synthesis)
         write_atomically(path / RECIPE_FILE, json.dumps(LIVE_RECIPE).encode())
-        _attach(path, synthesis, owned=True)
+        attach(path, synthesis, owned=True)
         source = synthesis.source
         return cls(path, source.observation_space, source.action_space, source.dataset.storage.jpeg_encoding)
 
@@ -104,7 +101,7 @@ class AugmentedStorage(MinariStorage):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle as the directory where that describes the dataset, else as the plan; never as open data."""
-        if self.synthesis is None or str(self.data_path) not in _live:
+        if self.synthesis is None or str(self.data_path) not in LIVE:
             return _read, (str(self.data_path),)
         plan = self.synthesis
         overlay: _Overlay = self._appended_buffers(), self.edited_metadata()
@@ -192,6 +189,18 @@ class AugmentedStorage(MinariStorage):
         i, k = j % self.n_real, j // self.n_real
         length, new = int(synthesis.lengths[number]), (variation or synthesis.variation(j)).spans
         return Provenance(True, i, k, merge_spans(self._source_provenance(i).spans, new, length=length), length)
+
+    def next_states(self, number: int, variation: Variation | None = None) -> dict[int, Batch]:
+        """Return the next states of an episode that are not `observations[t+1]`: batches of one row, keyed by step.
+
+        They come from literal seams, of this augmenter or of that of the source. Fits first, as `provenance` does.
+        """
+        if number < self.n_real:
+            source = self._plan().source
+            inner = source.dataset.storage
+            return inner.next_states(int(source.ids[number])) if isinstance(inner, AugmentedStorage) else {}
+        made = variation or self.variation(number)
+        return {} if made is None else made.next_states
 
     def get_episode_metadata(self, episode_indices: Iterable[int]) -> Iterator[dict[str, Any]]:
         """Yield the source's metadata of each episode with its provenance (see `Provenance.to_metadata`)."""
@@ -363,17 +372,6 @@ def register() -> None:
     _registry[DATA_FORMAT] = lambda: AugmentedStorage
 
 
-def _attach(path: pathlib.Path, synthesis: Synthesis, *, owned: bool) -> None:
-    _live[str(path)] = synthesis
-    if owned:
-        weakref.finalize(synthesis, _remove, str(path), os.getpid())
-
-
-def _remove(path: str, pid: int) -> None:
-    if os.getpid() == pid:  # a forked worker must not take its parent's directory away
-        shutil.rmtree(path, ignore_errors=True)
-
-
 _Overlay = tuple[list[EpisodeBuffer], dict[str, dict[str, Any]]]
 """What was added to a live dataset: appended episodes, and edits of metadata."""
 
@@ -384,7 +382,7 @@ def _read(path: str) -> MinariStorage:
 
 
 def _reopen(path: str, overlay: _Overlay, *plan: Any) -> MinariStorage:
-    if path in _live:
+    if path in LIVE:
         return MinariStorage.read(path)
     dataset, augmenter, count, seed = plan
     synthesis = Synthesis(Source(dataset), augmenter, count=count, seed=seed)
@@ -396,5 +394,5 @@ def _reopen(path: str, overlay: _Overlay, *plan: Any) -> MinariStorage:
         if edits:
             storage.update_episode_metadata(edits.values(), map(int, edits))
         return storage
-    _attach(pathlib.Path(path), synthesis, owned=False)
+    attach(pathlib.Path(path), synthesis, owned=False)
     return MinariStorage.read(path)

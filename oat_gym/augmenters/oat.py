@@ -15,6 +15,7 @@ from oat_gym.augmenters.generative import Learned, Matrices, check_kind, learn, 
 from oat_gym.augmenters.stitched import StitchedSampler, StitchingAugmenter, Windows, check_length
 from oat_gym.cache import Arrays
 from oat_gym.errors import ConfigurationError, InvalidDataError
+from oat_gym.export import INFOS_ROWS
 from oat_gym.mining import MiningConfig, MiningResult
 from oat_gym.mining.kept import mine_once
 from oat_gym.mining.state import mining_from_state, mining_to_state
@@ -145,7 +146,7 @@ def _windows(mining: MiningResult) -> Windows:
 def _warn_of_copies(mining: MiningResult, n_source: int) -> None:
     _windows(mining).warn_of_copies(
         n_source,
-        reason=f"hold no window of the PST sets (W={mining.length}; {mining.n_too_short} episodes are shorter)",
+        reason=f"hold no window of the PST sets (W={mining.length}; {mining.n_too_short} episodes have too few steps)",
         advice="A smaller length, fewer clusters or more sets (top) reach more episodes.",
     )
 
@@ -167,6 +168,10 @@ def _feature_columns(config: OAT, source: Source) -> npt.NDArray[np.int64]:
 
 
 def _times(config: OAT, source: Source) -> Sequence[npt.NDArray[np.float64]] | None:
+    """Return the times of the states that actions were taken in, (T_i,) each, or None.
+
+    Arrow and Parquet, written by `AugmentedDataset.save`, hold the first of T times twice.
+    """
     if config.times is None:
         return None
     times: list[npt.NDArray[np.float64]] = []
@@ -176,5 +181,7 @@ def _times(config: OAT, source: Source) -> Sequence[npt.NDArray[np.float64]] | N
             raise InvalidDataError(
                 f"Episode {number} has no time for each of its {length} steps in infos[{config.times!r}]."
             )
-        times.append(np.asarray(values, dtype=np.float64).reshape(len(values), -1)[:length, 0])
+        rows = np.asarray(values, dtype=np.float64).reshape(len(values), -1)[:, 0]
+        doubled = source.metadata[number].get(INFOS_ROWS) == length and len(rows) > length and rows[0] == rows[1]
+        times.append(rows[1 : length + 1] if doubled else rows[:length])
     return times

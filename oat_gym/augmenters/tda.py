@@ -76,5 +76,5 @@ class TDA(StitchingAugmenter):
         return StitchedSampler(self, source, seed, windows=windows, learned=learned)
 
     def _warn_of_copies(self, windows: Windows, source: Source) -> None:
-        reason = f"are shorter than W={self.length} steps and have no window"
+        reason = f"have no window of W={self.length} steps that may be replaced"
         windows.warn_of_copies(len(source), reason=reason, advice="A smaller length reaches more episodes.")

@@ -6,8 +6,10 @@ weights of a member lie in one row of a (K, P) matrix, so that an optimiser's st
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -108,18 +110,36 @@ class Adam:
         self._rates.mul_(self._decay)
 
 
+@dataclass
+class _Threads:
+    """The number of torch's threads before the first of the blocks that are open now, which run on one thread."""
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    blocks: int = 0
+    before: int = 1
+
+
+_threads = _Threads()
+
+
 @contextmanager
 def one_thread() -> Generator[None, None, None]:
-    """Run torch on one thread inside the block, then restore the setting.
+    """Run torch on one thread inside the block; the last of several open blocks restores the setting, which is global.
 
     The layers are too small to share out, and the results must not depend on the number of threads.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    with _threads.lock:
+        if not _threads.blocks:
+            _threads.before = torch.get_num_threads()
+            torch.set_num_threads(1)
+        _threads.blocks += 1
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        with _threads.lock:
+            _threads.blocks -= 1
+            if not _threads.blocks:
+                torch.set_num_threads(_threads.before)
 
 
 def _is_lstm(name: str) -> bool:

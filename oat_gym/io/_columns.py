@@ -268,10 +268,8 @@ def _stored_parts(data: MinariDataset, ids: list[int]) -> Iterator[Part]:
         for number, identity in enumerate(ids):
             variation = storage.variation(identity)
             mask = storage.provenance(identity, variation).mask
-            if variation is None:
-                yield Part(number, next(iter(data.iterate_episodes([identity]))), mask, {})
-            else:
-                yield Part(number, variation.episode, mask, variation.next_states)
+            episode = next(iter(data.iterate_episodes([identity]))) if variation is None else variation.episode
+            yield Part(number, episode, mask, storage.next_states(identity, variation))
         return
     metadata = storage.get_episode_metadata(ids)
     for number, (episode, known) in enumerate(zip(data.iterate_episodes(ids), metadata, strict=True)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,10 @@ from oat_gym.export import STORAGE_KEYS
 from oat_gym.io import _d4rl_note as notes
 from oat_gym.io._d4rl_file import Array, Flat, plain_value
 from oat_gym.io._d4rl_rows import rows_of, spaces_of
+from oat_gym.provenance import renumbered
 from oat_gym.serialization import metadata_to_json, source_metadata
+from oat_gym.spaces import in_kind_of
+from oat_gym.storage import AugmentedStorage
 
 
 def columns_of(data: MinariDataset) -> Flat:
@@ -26,6 +30,8 @@ def columns_of(data: MinariDataset) -> Flat:
     episodes = list(data.iterate_episodes())
     if not episodes:
         raise InvalidDataError(f"The dataset {data.id!r} (or this view of it) has no episodes to write.")
+    _check_seams(data)
+    episodes = _of_one_kind(episodes, data)
     for number, episode in enumerate(episodes):
         check_episode(episode, data.observation_space, data.action_space)
         _check_flags(number, episode)
@@ -96,6 +102,31 @@ def join_rows(name: str, parts: list[Any]) -> Array | list[str]:
     return np.concatenate(parts)
 
 
+def _of_one_kind(episodes: list[EpisodeData], data: MinariDataset) -> list[EpisodeData]:
+    """Return the episodes with numbers of one kind where generated ones are floats and recorded ones integers."""
+    kinds = {tuple(np.asarray(part).dtype.kind for part in (e.observations, e.actions, e.rewards)) for e in episodes}
+    if len(kinds) == 1:
+        return episodes
+    return [
+        replace(
+            episode,
+            observations=in_kind_of(data.observation_space, episode.observations),
+            actions=in_kind_of(data.action_space, episode.actions),
+            rewards=episode.rewards.astype(np.float64) if episode.rewards.dtype.kind in "biu" else episode.rewards,
+        )
+        for episode in episodes
+    ]
+
+
+def _check_seams(data: MinariDataset) -> None:
+    storage = data.storage
+    if isinstance(storage, AugmentedStorage) and any(storage.next_states(int(n)) for n in data.episode_indices):
+        raise InvalidDataError(
+            "Transitions at literal seams have next states of their own, and readers of D4RL's layout take the next "
+            "row's observation. Augment with seam='contiguous' or 'matched', or use transitions()."
+        )
+
+
 def _check_flags(number: int, episode: EpisodeData) -> None:
     early = np.flatnonzero(np.asarray(episode.truncations)[:-1])
     if len(early):
@@ -121,7 +152,7 @@ def _note_of(data: MinariDataset, raw: Mapping[str, Any], episodes: list[Episode
     metadata = {key: value for key, value in raw.items() if key not in STORAGE_KEYS}
     if isinstance(metadata.get("d4rl"), Mapping):
         metadata["d4rl"] = {key: value for key, value in metadata["d4rl"].items() if key != "metadata"}
-    per_episode = data.storage.get_episode_metadata(data.episode_indices)
+    per_episode = renumbered(data.storage.get_episode_metadata(data.episode_indices), data.episode_indices)
     return notes.Note(
         lengths=tuple(len(e.rewards) for e in episodes),
         unflagged=tuple(number for number, end in enumerate(ends) if end == (False, False)),

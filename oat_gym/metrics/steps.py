@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 from minari import EpisodeData, MinariDataset
 
-from oat_gym.dataset import AugmentedDataset
 from oat_gym.episodes import IntArray, collect_transitions
 from oat_gym.errors import InvalidDataError
 from oat_gym.provenance import Provenance
 from oat_gym.spaces import Batch, FlatSpace, FloatMatrix
+from oat_gym.storage import AugmentedStorage
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -111,14 +111,12 @@ def read_steps(dataset: MinariDataset) -> Contents:
 
 def _episodes(dataset: MinariDataset) -> Iterator[tuple[int, EpisodeData, Provenance, dict[int, Batch]]]:
     """Yield number, data, provenance and differing next states of each episode."""
-    if isinstance(dataset, AugmentedDataset):
+    if isinstance(dataset.storage, AugmentedStorage):  # Minari's own views of one are plain MinariDatasets
         for number in map(int, dataset.episode_indices):
             variation = dataset.storage.variation(number)  # made once, for the provenance too
             origin = dataset.storage.provenance(number, variation)
-            if variation is None:
-                yield number, next(iter(dataset.iterate_episodes([number]))), origin, {}
-            else:
-                yield number, variation.episode, origin, variation.next_states
+            episode = next(iter(dataset.iterate_episodes([number]))) if variation is None else variation.episode
+            yield number, episode, origin, dataset.storage.next_states(number, variation)
         return
     numbers = [int(number) for number in dataset.episode_indices]
     metadata = dataset.storage.get_episode_metadata(numbers)

@@ -78,7 +78,7 @@ class MiningConfig:
                 init=self.init,
             )
         if self.length != "auto":
-            check_length(self.length)
+            object.__setattr__(self, "length", check_length(self.length))  # NumPy's integers too
         if not 0 < self.auto_share <= 1:
             raise ConfigurationError(f"auto_share must lie in (0, 1], got {self.auto_share!r}.")
         self._check_selection()

@@ -15,6 +15,7 @@ from oat_gym.episodes import BoolArray, IntArray, Transitions, check_episode, co
 from oat_gym.errors import InvalidDataError
 from oat_gym.provenance import Provenance
 from oat_gym.spaces import Batch, FlatSpace, map_tree
+from oat_gym.storage import AugmentedStorage
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -124,8 +125,8 @@ class Logged:
 
 
 def _steps(dataset: MinariDataset, origins: list[Provenance]) -> Transitions:
-    if isinstance(dataset, AugmentedDataset):
-        return dataset.transitions()
+    if isinstance(dataset.storage, AugmentedStorage):  # Minari's own views of one are plain MinariDatasets
+        return AugmentedDataset.open(dataset.storage, dataset.episode_indices).transitions()
 
     def checked(episodes: Iterable[EpisodeData]) -> Iterable[EpisodeData]:
         for episode in episodes:
