@@ -208,8 +208,8 @@ class AugmentedDataset(MinariDataset):
 
         HDF5 stores exactly what is iterated. Arrow and Parquet hold infos of T+1 rows only: infos of T rows get a copy
         of their first row before them there, and the episode's metadata has `infos_rows` = T; integers recorded for
-        real numbers (rewards, spaces of floats) become floats. Literal seams keep their own next states in a recipe
-        only: a warning tells of them.
+        real numbers (rewards, spaces of floats) become floats. Next states other than `observations[t+1]` (literal
+        seams, permuted segments) are kept in a recipe only: a warning tells of them.
 
         Args:
             dataset_id: (namespace/)name-v(version), free.
@@ -248,8 +248,9 @@ class AugmentedDataset(MinariDataset):
     def _warn_of_lost_seams(self) -> None:
         if any(self.storage.next_states(int(number)) for number in self.episode_indices):
             warnings.warn(
-                "Transitions at literal seams have next states of their own, which Minari's formats cannot hold: the "
-                "saved dataset will have observations[t+1] there. Save with lazy=True, or read transitions().",
+                "Some transitions (literal seams, permuted segments) have a next state of their own, which Minari's "
+                "formats cannot hold: the saved dataset has observations[t+1] there, as its episodes do. Save with "
+                "lazy=True to keep them for transitions(), to_torch and evaluate.",
                 AugmentationWarning,
                 stacklevel=3,
             )

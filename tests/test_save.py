@@ -1,6 +1,8 @@
 """Saving: in Minari's formats, and as a recipe."""
 
+import dataclasses
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,13 +13,21 @@ from gymnasium import spaces
 from minari import EpisodeData
 from minari.data_collector import EpisodeBuffer
 
-from oat_gym import OAT, AugmentedDataset, Function
-from oat_gym.errors import ConfigurationError, DatasetExistsError, InvalidDataError, SourceChangedError
+from oat_gym import OAT, AugmentedDataset, Function, Permutation, read_d4rl, write_d4rl
+from oat_gym.errors import (
+    AugmentationWarning,
+    ConfigurationError,
+    DatasetExistsError,
+    InvalidDataError,
+    SourceChangedError,
+)
+from oat_gym.ope.logged import Logged
 from oat_gym.provenance import Provenance
-from tests.conftest import install_dataset
+from tests.conftest import install_dataset, walks
 
 MakeDataset = Callable[..., minari.MinariDataset]
 LENGTHS = [3, 7, 1, 5]
+BOX2 = spaces.Box(-np.inf, np.inf, (2,))
 
 
 def same(episode: EpisodeData, rng: np.random.Generator) -> EpisodeData:
@@ -111,6 +121,67 @@ def test_a_view_is_saved_as_the_view(make_dataset: MakeDataset) -> None:
     loaded = view.save("test/view-v0")
     assert [len(episode) for episode in loaded] == [5, 5, 5]
     np.testing.assert_array_equal(loaded[2].rewards, data[11].rewards)
+
+
+@pytest.mark.parametrize("kind", ["minari", "d4rl"])
+def test_a_saved_view_counts_the_sources_of_its_copies_anew(tmp_path: Path, kind: str) -> None:
+    """Estimators resample real episodes: a copy that names the wrong one would be drawn with it."""
+    data = AugmentedDataset(install_dataset("test/walks-v0", walks(4, 5), BOX2, BOX2), Function(same), factor=3)
+    view = data.filter_episodes(lambda episode: episode.id % 4 != 0)
+    if kind == "minari":
+        saved = view.save("test/view-v0")
+    else:
+        saved = read_d4rl(write_d4rl(view, tmp_path / "view.hdf5"))
+    assert Logged.of(saved).unit.tolist() == Logged.of(view).unit.tolist() == [0, 1, 2] * 3
+    for number, metadata in enumerate(saved.storage.get_episode_metadata(range(9))):
+        origin = Provenance.from_metadata(metadata, number)
+        assert origin.source == number % 3
+        np.testing.assert_array_equal(saved[origin.source].observations[0], saved[number].observations[0])
+
+
+def test_next_states_that_are_no_observation_stay_wherever_they_can() -> None:
+    """Permuted segments keep their own next states: in views of Minari's, as a source, not in files."""
+    data = AugmentedDataset(install_dataset("test/walks-v0", walks(4, 9), BOX2, BOX2), Permutation(), factor=3)
+    wanted = data.transitions().next_observations
+    assert (wanted != np.concatenate([episode.observations[1:] for episode in data])).any()
+    (part,) = minari.split_dataset(data, [12], seed=0)
+    order = np.asarray(part.episode_indices)
+    rows = np.concatenate([np.flatnonzero(data.transitions().episode == number) for number in order])
+    np.testing.assert_array_equal(Logged.of(part).steps.next_observations, wanted[rows])
+    again = AugmentedDataset(data, Function(same), count=0)
+    np.testing.assert_array_equal(again.transitions().next_observations, wanted)
+    with pytest.warns(AugmentationWarning, match=r"the saved dataset has observations\[t\+1\] there"):
+        saved = data.save("test/permuted-v0")
+    np.testing.assert_array_equal(
+        AugmentedDataset(saved, Function(same), count=0).transitions().next_observations,
+        np.concatenate([episode.observations[1:] for episode in data]),
+    )
+    with pytest.raises(InvalidDataError, match="have a next state of their own"):
+        write_d4rl(data, Path("never.hdf5"))
+
+
+@pytest.mark.parametrize("data_format", ["arrow", "parquet"])
+def test_integers_recorded_for_real_numbers_are_saved_beside_generated_floats(data_format: str) -> None:
+    def whole(buffer: EpisodeBuffer) -> EpisodeBuffer:
+        return dataclasses.replace(
+            buffer,
+            observations=np.round(buffer.observations).astype(np.int64),
+            rewards=np.round(buffer.rewards).astype(np.int64),
+        )
+
+    def halves(episode: EpisodeData, rng: np.random.Generator) -> EpisodeData:
+        return dataclasses.replace(
+            episode, observations=episode.observations.astype(np.float32) + 0.5, rewards=episode.rewards + 0.5
+        )
+
+    source = install_dataset("test/whole-v0", [whole(buffer) for buffer in walks(3, 5)], BOX2, BOX2)
+    data = AugmentedDataset(source, Function(halves), factor=2)
+    saved = data.save("test/both-v0", data_format=data_format)
+    for got, made in zip(saved, data, strict=True):
+        np.testing.assert_array_equal(got.observations, made.observations)
+        np.testing.assert_array_equal(got.rewards, made.rewards)
+    rows = read_d4rl(write_d4rl(data, Path(os.environ["MINARI_DATASETS_PATH"]) / "both.hdf5"))
+    np.testing.assert_array_equal(rows[0].rewards, data[0].rewards)
 
 
 def test_metadata_of_the_source_survives(make_dataset: MakeDataset) -> None:

@@ -122,8 +122,8 @@ def _check_seams(data: MinariDataset) -> None:
     storage = data.storage
     if isinstance(storage, AugmentedStorage) and any(storage.next_states(int(n)) for n in data.episode_indices):
         raise InvalidDataError(
-            "Transitions at literal seams have next states of their own, and readers of D4RL's layout take the next "
-            "row's observation. Augment with seam='contiguous' or 'matched', or use transitions()."
+            "Some transitions (literal seams, permuted segments) have a next state of their own, where readers of D4RL's "
+            "layout take the next row's observation. Use seam='contiguous' or 'matched', another method, or transitions()."
         )
 
 

@@ -174,8 +174,8 @@ def _check_contiguous(steps: dict[str, npt.NDArray[Any]]) -> None:
     if len(seams):
         raise InvalidDataError(
             f"{len(seams)} transitions, the first at step {steps['step'][seams[0]]} of episode "
-            f"{steps['episode'][seams[0]]}, keep their own next state (seam='literal'), which d3rlpy's format cannot "
-            "hold. Augment with seam='contiguous' or 'matched', or use to_torch or to_torchrl."
+            f"{steps['episode'][seams[0]]}, keep their own next state (literal seams, permuted segments), which "
+            "d3rlpy's format cannot hold. Use seam='contiguous' or 'matched', another method, or to_torch or to_torchrl."
         )
 
 

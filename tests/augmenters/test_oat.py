@@ -12,7 +12,7 @@ from minari.data_collector import EpisodeBuffer
 
 import oat_gym
 from oat_gym import OAT, AugmentedDataset, MiningConfig
-from oat_gym.augmenters import stitched
+from oat_gym.augmenters import oat, stitched
 from oat_gym.episodes import content_hash
 from oat_gym.errors import AugmentationWarning, ConfigurationError, InvalidDataError, UnsupportedSpaceError
 from oat_gym.generation import BehaviorConfig, VAEMDPConfig
@@ -343,6 +343,23 @@ def test_constant_features_and_episodes_of_one_step_are_modelled() -> None:
     for episode in AugmentedDataset(real, config, factor=2):
         np.testing.assert_array_equal(episode.observations[:, 1], 7)
         assert len(episode) == 1
+
+
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
+def test_times_are_those_of_their_steps_in_every_format(data_format: str) -> None:
+    """Arrow cannot hold T rows of infos: `save` doubles the first, and gaps between times would move by a step."""
+    buffers = [dataclasses.replace(b, infos={"hour": np.arange(len(b.rewards)) ** 2.0}) for b in walks(4, 9)]
+    box = spaces.Box(-100, 100, (2,))
+    real = AugmentedDataset(install_dataset("test/timed-v0", buffers, box, spaces.Box(-1, 1, (2,))), count=0)
+    source = Source(real.save("test/copy-v0", data_format=data_format))
+    for times, buffer in zip(oat._times(OAT(times="hour"), source) or (), buffers, strict=True):
+        np.testing.assert_array_equal(times, buffer.infos["hour"])
+
+
+def test_a_length_may_be_one_of_numpys_integers(walk_dataset: minari.MinariDataset, tiny_oat: OAT) -> None:
+    config = dataclasses.replace(tiny_oat, mining=dataclasses.replace(tiny_oat.mining, length=np.int64(50)))
+    with pytest.raises(InvalidDataError, match="No episode is as long as a sub-trajectory of 50 steps"):
+        AugmentedDataset(walk_dataset, config)
 
 
 @pytest.mark.shared_data

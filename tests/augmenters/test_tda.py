@@ -99,7 +99,7 @@ def test_episodes_without_a_window_are_copied_and_it_says_so(
 
     config = TDA(length=5, policy=Still() if with_policy else None, **QUICK)
     data = AugmentedDataset(make_dataset([9, 4, 1, 7]), config, factor=2)
-    with pytest.warns(AugmentationWarning, match=r"2 of 4 episodes are shorter than W=5 .* exact copies") as caught:
+    with pytest.warns(AugmentationWarning, match=r"2 of 4 episodes have no window of W=5 .* exact copies") as caught:
         data.fit()
     assert len(caught) == 1
     assert data.provenance(5).spans == ()

@@ -10,6 +10,7 @@ import torch
 from oat_gym.errors import ConfigurationError, InvalidDataError, TrainingError
 from oat_gym.generation import PAPER_LEARNING_RATES, Sequences, VAEMDPConfig, fit_many, fit_vae_mdp
 from oat_gym.generation import training as training_module
+from oat_gym.generation._layers import one_thread
 from oat_gym.generation._tracker import BestTracker
 from oat_gym.generation.sequences import hold_out
 from oat_gym.generation.vae_mdp import VAEMDPNetwork
@@ -205,3 +206,19 @@ def test_kl_terms_come_in_slowly_for_discrete_states_only():
     assert VAEMDPNetwork(real, discrete, VAEMDPConfig()).kl_warmup == 0
     assert VAEMDPNetwork(discrete, real, VAEMDPConfig.from_preset("paper")).kl_warmup == 0
     assert VAEMDPNetwork(real, real, VAEMDPConfig(kl_warmup=7)).kl_warmup == 7
+
+
+def test_the_number_of_threads_is_restored_by_the_last_block_that_ends():
+    """Two datasets that are fitted in threads: the first to begin may end before the other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(before + 1)
+    try:
+        first, second = one_thread(), one_thread()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert torch.get_num_threads() == 1
+        second.__exit__(None, None, None)
+        assert torch.get_num_threads() == before + 1
+    finally:
+        torch.set_num_threads(before)
