@@ -128,10 +128,8 @@ def test_a_saved_view_counts_the_sources_of_its_copies_anew(tmp_path: Path, kind
     """Estimators resample real episodes: a copy that names the wrong one would be drawn with it."""
     data = AugmentedDataset(install_dataset("test/walks-v0", walks(4, 5), BOX2, BOX2), Function(same), factor=3)
     view = data.filter_episodes(lambda episode: episode.id % 4 != 0)
-    if kind == "minari":
-        saved = view.save("test/view-v0")
-    else:
-        saved = read_d4rl(write_d4rl(view, tmp_path / "view.hdf5"))
+    in_minari = kind == "minari"
+    saved = view.save("test/view-v0") if in_minari else read_d4rl(write_d4rl(view, tmp_path / "view.hdf5"))
     assert Logged.of(saved).unit.tolist() == Logged.of(view).unit.tolist() == [0, 1, 2] * 3
     for number, metadata in enumerate(saved.storage.get_episode_metadata(range(9))):
         origin = Provenance.from_metadata(metadata, number)

@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from oat_gym.benchmark.improvement import Improvement, improve, over_related, over_tasks
+from oat_gym.benchmark.improvement import Improvement, between_tasks, improve, over_related, over_tasks
 from oat_gym.benchmark.results import Results
 from oat_gym.benchmark.scores import METRICS, Draws, Metric, draw_scores, score
 from oat_gym.benchmark.store import CellResult
 from oat_gym.benchmark.variants import NONE
+from oat_gym.domains import TASKS
 
 FloatArray = npt.NDArray[np.float64]
 MEAN = "mean"
@@ -54,7 +55,7 @@ class Analysis:
         for cell in self.results.cells:
             if not cell.failed:
                 self._cells.setdefault((cell.dataset, cell.variant, cell.family), {})[cell.seed] = cell
-        self._tasks = {cell.dataset: cell.task for cell in self.results.cells}
+        self._tasks = {cell.dataset: _episodes_of(cell.task) for cell in self.results.cells}
         known = {cell.dataset for cell in self.results.cells if not cell.failed and cell.knows_truth}
         self._known = tuple(name for name in self.results.datasets if name in known)
 
@@ -82,12 +83,19 @@ class Analysis:
             return None
         return float(score(np.full(len(cell.true), self.results.recorded[dataset][0]), cell.true, "mae"))
 
-    def scores(self, dataset: str, variant: str, family: str, metric: Metric) -> FloatArray:
-        """Return the metric of each seed, (S,); empty where nothing was measured."""
+    def scores(
+        self, dataset: str, variant: str, family: str, metric: Metric, *, seeds: Sequence[int] | None = None
+    ) -> FloatArray:
+        """Return the metric of each seed, or of those in `seeds`, (S,); empty where nothing was measured."""
         cells = self.cells(dataset, variant, family)
         if not cells or not cells[0].knows_truth:
             return np.empty(0)
-        return self._draw(dataset, variant, family, tuple(cell.seed for cell in cells), metric).points
+        there = tuple(cell.seed for cell in cells) if seeds is None else tuple(seeds)
+        return self._draw(dataset, variant, family, there, metric).points
+
+    def common_seeds(self, dataset: str, variant: str, families: Sequence[str]) -> tuple[int, ...]:
+        """Return the seeds of a variant that were finished for all of some families."""
+        return self._seeds(dataset, (variant,), families)
 
     def finding(
         self, dataset: str, variant: str, family: str, metric: Metric, *, baseline: str = NONE
@@ -123,11 +131,13 @@ class Analysis:
         *,
         baseline: str = NONE,
         datasets: Sequence[str] | None = None,
+        between: bool = False,
     ) -> Finding | None:
         """Return the mean over all tasks, each the mean of its datasets; None where no dataset has two seeds or more.
 
-        Datasets of one task share policies and may share episodes (`over_related`). Those of one seed are left out.
-        `datasets` takes some datasets alone.
+        Datasets of one task share policies or episodes (`over_related`). Those of one seed are left out. `datasets`
+        takes some datasets alone. The interval is of these datasets, or with `between` of how much the tasks differ
+        (`between_tasks`).
         """
         found = [
             each
@@ -141,7 +151,7 @@ class Analysis:
         tasks: dict[str, list[Improvement]] = {}
         for each in found:
             tasks.setdefault(self._tasks[each.datasets[0]], []).append(each.improvement)
-        mean = over_tasks([over_related(members) for members in tasks.values()])
+        mean = (between_tasks if between else over_tasks)([over_related(members) for members in tasks.values()])
         families = tuple(dict.fromkeys(name for each in found for name in each.families))
         return Finding(tuple(each.datasets[0] for each in found), variant, family, metric, mean, families, baseline)
 
@@ -169,3 +179,9 @@ class Analysis:
             values, replicates = np.stack([c.values for c in cells]), np.stack([c.replicates for c in cells])
             self._draws[key] = draw_scores(values, replicates, cells[0].true, cells[0].true_errors, metric)
         return self._draws[key]
+
+
+def _episodes_of(task: str) -> str:
+    """Return the task whose recorded episodes a task's datasets hold: mostly its own."""
+    known = TASKS.get(task)
+    return task if known is None else known.episodes_of or task

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import math
 import re
 import time
 from collections.abc import Iterator, Mapping
@@ -14,9 +13,10 @@ import jinja2
 
 from oat_gym.benchmark import story
 from oat_gym.benchmark.analysis import MEAN, Analysis
+from oat_gym.benchmark.grid import format_number
 from oat_gym.benchmark.results import Results, read_results
 from oat_gym.benchmark.scores import METRICS
-from oat_gym.benchmark.tables import all_tables, budget_lines, dataset_table, format_number
+from oat_gym.benchmark.tables import USES, all_tables, budget_lines, dataset_table
 from oat_gym.cache import Arrays, write_atomically
 
 TEMPLATE = "page.html.jinja"
@@ -60,7 +60,7 @@ def _render(settings: list[dict[str, Any]]) -> str:
     )
     template = environment.get_template(TEMPLATE)
     made = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
-    return template.render(made=made, settings=settings, metrics=METRICS)
+    return template.render(made=made, settings=settings, metrics=METRICS, uses=USES)
 
 
 def _setting(results: Results) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def _setting(results: Results) -> dict[str, Any]:
         "groups": [_group(analysis, group, level) for group, level in groups],
         "levels": story.by_level(analysis),
         "datasets": [_dataset(analysis, name) for name in results.datasets if name not in analysis.failed()],
-        "n_findings": sum(math.isfinite(found.improvement.value) for found in analysis.all_findings()),
+        "n_findings": sum(found.improvement.decides for found in analysis.all_findings()),
         "doubts": _doubts(analysis),
         "costs": _costs(results),
         "environments": _environments(results),
@@ -207,7 +207,7 @@ def _doubts(analysis: Analysis) -> list[tuple[str, int]]:
     """Return how often each source of uncertainty is the largest, of the means over estimators, the commonest first."""
     counts: dict[str, int] = {}
     for found in analysis.all_findings():
-        if found.family == MEAN and math.isfinite(found.improvement.value):
+        if found.family == MEAN and found.improvement.decides:
             counts[found.improvement.parts.main] = counts.get(found.improvement.parts.main, 0) + 1
     return sorted(counts.items(), key=lambda pair: -pair[1])
 

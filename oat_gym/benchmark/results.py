@@ -50,6 +50,8 @@ class Setting:
         """Return it in words."""
         where = "the environment's first states" if self.question.initial == "reset" else "the data's first states"
         changed = "".join(f", {name} {value}" for name, value in self._unusual())
+        if self.question.initial == "data":
+            where += " (true values: from the environment's, where the task has one)"
         return f"budget {self.budget!r}, values from {where}, behaviour policy {self.question.behavior!r}{changed}"
 
     def _unusual(self) -> list[tuple[str, Any]]:
@@ -198,7 +200,8 @@ def with_truth(cells: Iterable[CellResult], manifests: Sequence[Mapping[str, Any
         if truth is None or cell.failed:
             yield cell
             continue
-        pairs = np.array([truth[name] for name in cell.policies], dtype=np.float64).reshape(-1, 2)
+        unknown = (math.nan, math.nan)
+        pairs = np.array([truth.get(name, unknown) for name in cell.policies], dtype=np.float64).reshape(-1, 2)
         yield replace(cell, true=pairs[:, 0], true_errors=pairs[:, 1])
 
 

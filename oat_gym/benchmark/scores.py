@@ -33,7 +33,8 @@ DRAWS = 400
 def score(values: npt.ArrayLike, true: npt.ArrayLike, metric: Metric) -> FloatArray:
     """Return a metric of each row of estimates (..., P) against true values (..., P), which are broadcast.
 
-    NaN where the metric is undefined: an estimate is NaN, ranks of equal estimates, regret@5 of five policies or fewer.
+    NaN where the metric is undefined: an estimate is NaN, ranks of equal estimates, regret@5 of five policies or fewer
+    (in a resample: of five different ones or fewer).
 
     >>> score([[1.0, 2.0], [2.0, 1.0]], [1.0, 2.0], "mae").tolist()
     [0.0, 1.0]
@@ -86,7 +87,7 @@ def _regret(estimates: FloatArray, truth: FloatArray, present: npt.NDArray[np.bo
     """Return (best - expected best among the k highest estimates) / |best| over the policies that are present."""
     if k > 1 and estimates.shape[-1] <= k:
         return np.full(estimates.shape[:-1], math.nan)
-    undefined = (np.isnan(estimates) & present).any(axis=-1)
+    undefined = (np.isnan(estimates) & present).any(axis=-1) | ((k > 1) & (present.sum(axis=-1) <= k))
     ranked = np.where(present & ~np.isnan(estimates), estimates, -np.inf)
     best = np.where(present, truth, -np.inf).max(axis=-1)
     threshold = np.sort(ranked, axis=-1)[..., -k]

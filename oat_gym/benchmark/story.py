@@ -14,9 +14,10 @@ from oat_gym import plots
 from oat_gym.benchmark import figures, paper
 from oat_gym.benchmark.analysis import MEAN, Analysis, Finding
 from oat_gym.benchmark.figures import Panel
+from oat_gym.benchmark.grid import format_number
 from oat_gym.benchmark.improvement import Improvement
 from oat_gym.benchmark.scores import METRICS, Metric
-from oat_gym.benchmark.tables import adroit_dataset, format_number, stand_ins_of
+from oat_gym.benchmark.tables import adroit_dataset, stand_ins_of
 from oat_gym.benchmark.variants import NONE, VARIANTS
 from oat_gym.cache import Arrays
 from oat_gym.domains import maze2d

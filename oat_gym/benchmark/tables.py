@@ -1,26 +1,27 @@
-"""The paper's tables in its layout, our numbers beside the paper's, as markdown and CSV."""
+"""The paper's tables in its layout, our numbers beside the paper's, and tables of all that was found."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from oat_gym.benchmark import paper
 from oat_gym.benchmark.analysis import MEAN, Analysis, Finding
+from oat_gym.benchmark.grid import Table, format_number
 from oat_gym.benchmark.results import Results
 from oat_gym.benchmark.scores import METRICS, Metric
 from oat_gym.benchmark.variants import NONE, VARIANTS
-from oat_gym.cache import write_atomically
 from oat_gym.ope import metrics as ope_metrics
 
 SIGNS = {"helps": "+", "hurts": "-", "no evidence": "", "not measured": ""}
 """What stands behind a number that differs from no augmentation with an interval that excludes zero."""
+USES = (
+    "oat and its forms use synthetic episodes for training alone, the paper's methods for every estimator: IS with "
+    "the former sees the recorded episodes alone."
+)
+"""What must be known where means over the estimators are compared."""
 FLOOR = "mean recorded return"
 """In the place of an estimator: the log's own average, said of every policy."""
 EXPERT = "expert"
@@ -30,32 +31,6 @@ RIVALS = ("oat-paper", "oat")
 """The forms of OAT that every other variant is compared with."""
 RIVALRY: tuple[Metric, ...] = ("mae", "rank_correlation")
 """The metrics by which they are: those of the paper's claim to be ahead of every other method."""
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table as text: `name` for files, a caption, a header and rows of as many cells."""
-
-    name: str
-    caption: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-    def to_markdown(self) -> str:
-        """Return it as a markdown table under its caption."""
-        lines = [f"**{self.caption}**", "", _line(self.header), _line(("---",) * len(self.header))]
-        return "\n".join([*lines, *(_line(row) for row in self.rows), ""])
-
-    def to_csv(self) -> str:
-        """Return it as CSV, without the caption."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerows([self.header, *self.rows])
-        return text.getvalue()
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def all_tables(analysis: Analysis) -> tuple[Table, ...]:
@@ -74,20 +49,6 @@ def all_tables(analysis: Analysis) -> tuple[Table, ...]:
     made += [overview_table(analysis, metric, baseline=name) for metric in RIVALRY for name in (NONE, *RIVALS)]
     made.append(improvement_table(analysis))
     return tuple(table for table in made if table is not None)
-
-
-def write_tables(tables: Sequence[Table], folder: Path) -> list[Path]:
-    """Write each table as NAME.md and NAME.csv and all of them as tables.md; return the paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    files = {f"{table.name}.{ending}": text for table in tables for ending, text in _forms(table)}
-    files["tables.md"] = "\n".join(table.to_markdown() for table in tables)
-    for name, text in files.items():
-        write_atomically(folder / name, text.encode())
-    return [folder / name for name in files]
-
-
-def _forms(table: Table) -> tuple[tuple[str, str], ...]:
-    return (("md", table.to_markdown()), ("csv", table.to_csv()))
 
 
 def adroit_dataset(analysis: Analysis, level: str, task: str) -> str | None:
@@ -172,7 +133,8 @@ def help_table(analysis: Analysis, dataset: str, metric: Metric, *, baseline: st
     question, other = ("Did it help", "no augmentation") if plain else (f"Is it better than {baseline}", baseline)
     caption = (
         f"{question} on {dataset}? Improvement of the {METRICS[metric]} over {other} ({unit}, positive is "
-        f"better), 95% interval and verdict. {_notes(analysis, {dataset: dataset}, signs=False)}"
+        f"better), 95% interval and verdict; of FQE and MB from given starts it is for these recorded episodes. "
+        f"{_notes(analysis, {dataset: dataset}, signs=False)}{'' if plain else f' {USES}'}"
     )
     name = f"helped-{metric}-{dataset}" if plain else f"against-{baseline}-{metric}-{dataset}"
     return Table(name, caption, ("variant", "seeds", *columns), tuple(rows))
@@ -181,8 +143,8 @@ def help_table(analysis: Analysis, dataset: str, metric: Metric, *, baseline: st
 def overview_table(analysis: Analysis, metric: Metric, *, baseline: str = NONE) -> Table | None:
     """Return the improvement of the mean over the estimators, a row for each variant and a column for each dataset.
 
-    Before them: the mean over all tasks (`Analysis.over_all`), and on how many datasets, of those with two seeds or
-    more, a variant helps and hurts. None for one dataset, which has a table itself.
+    Before them: the mean over all tasks in both forms of `Analysis.over_all`, and on how many datasets, of those with
+    two seeds or more, a variant helps and hurts. None for one dataset, which has a table itself.
     """
     datasets = analysis.with_truth()
     rows: list[tuple[str, ...]] = []
@@ -191,20 +153,24 @@ def overview_table(analysis: Analysis, metric: Metric, *, baseline: str = NONE) 
         verdicts = [each.improvement.verdict for each in found if each is not None and each.improvement.n_seeds > 1]
         counts = [f"{verdicts.count(verdict)} of {len(verdicts)}" for verdict in ("helps", "hurts")]
         if any(each is not None for each in found):
-            whole = _verdict_text(analysis.over_all(variant, MEAN, metric, baseline=baseline))
-            rows.append((variant, whole, *counts, *(_overview_text(each) for each in found)))
+            whole = [
+                _verdict_text(analysis.over_all(variant, MEAN, metric, baseline=baseline, between=between))
+                for between in (False, True)
+            ]
+            rows.append((variant, *whole, *counts, *(_overview_text(each) for each in found)))
     if len(datasets) < 2 or not rows:
         return None
     unit, plain = "percent less error" if metric == "mae" else "in its own unit", baseline == NONE
     caption = (
         f"Improvement of the {METRICS[metric]}, the estimators' mean, over {'no augmentation' if plain else baseline} "
         f"({unit}, positive is better), 95% interval and verdict. {analysis.results.setting.describe()}. Over all: the "
-        "mean over tasks of two seeds or more; datasets of one task share its policies and count as one. The seeds of "
-        "each dataset are in its own table."
+        "mean over tasks of two seeds or more; datasets that share policies or episodes count as one. Its first "
+        "interval is of these datasets, the second, of another such task, comes from how much the tasks differ. The "
+        f"seeds of each dataset are in its own table. {USES}"
     )
     words = ("helps on", "hurts on") if plain else ("better on", "worse on")
     name = f"overview-{metric}" if plain else f"overview-against-{baseline}-{metric}"
-    return Table(name, caption, ("variant", "over all", *words, *datasets), tuple(rows))
+    return Table(name, caption, ("variant", "over all", "another task", *words, *datasets), tuple(rows))
 
 
 def _overview_text(found: Finding | None) -> str:
@@ -247,14 +213,15 @@ def table_1(analysis: Analysis, dataset: str) -> Table | None:
     """Return table 1 for a dataset with a policy "expert": t and p of each other policy, by importance sampling.
 
     "paper" is Welch's test of the two samples of replicates, as the paper describes it; its t grows with the number of
-    resamples. "paired" takes the deviation of paired differences as standard error (`ope.metrics.t_test`).
+    resamples. "paired" takes the deviation of paired differences as standard error (`ope.metrics.t_test`). The last
+    column has the paper's own numbers, of the three policies of its tutoring data.
     """
     cells = analysis.cells(dataset, NONE, "IS")
     if not cells or EXPERT not in cells[0].policies:
         return None
     others = [name for name in cells[0].policies if name != EXPERT]
     rows = [
-        (_method(variant), method, *_tests(analysis, dataset, variant, others, method))
+        (_method(variant), method, *_tests(analysis, dataset, variant, others, method), _paper_tests(variant, method))
         for variant in analysis.results.variants
         for method in ("paper", "paired")
         if analysis.cells(dataset, variant, "IS")
@@ -264,7 +231,13 @@ def table_1(analysis: Analysis, dataset: str) -> Table | None:
         f"Table 1. t and p of each policy against {EXPERT!r} on {dataset}, by importance sampling. "
         f"{analysis.results.setting.describe()}."
     )
-    return Table(f"table-01-{dataset}", caption, ("method", "test", *others), tuple(rows))
+    return Table(f"table-01-{dataset}", caption, ("method", "test", *others, "the paper's three"), tuple(rows))
+
+
+def _paper_tests(variant: str, method: str) -> str:
+    row = VARIANTS[variant].paper if variant in VARIANTS else ""
+    printed = paper.TABLE_1.get("NoAug." if variant == NONE else row, ()) if method == "paper" else ()
+    return "; ".join(f"{t:.2f} ({p:.2f})" for t, p in printed)
 
 
 def _tests(analysis: Analysis, dataset: str, variant: str, others: Sequence[str], method: str) -> list[str]:
@@ -295,15 +268,19 @@ def _empirical(analysis: Analysis, dataset: str, others: Sequence[str]) -> list[
         error = math.hypot(cell.true_errors[p], cell.true_errors[q])
         t = float(cell.true[p] - cell.true[q]) / error if error > 0 else math.nan
         texts.append("exact" if math.isnan(t) else f"{t:.2f} ({2 * stats.norm.sf(abs(t)):.2f})")
-    return [("Empirical result", "roll-outs", *texts)]
+    printed = "; ".join(f"{t:.2f} ({p:.2f})" for t, p in paper.TABLE_1["Empirical result"])
+    return [("Empirical result", "roll-outs", *texts, printed)]
 
 
 def cell_text(analysis: Analysis, dataset: str, variant: str, family: str, metric: Metric) -> str:
-    """Return our number of a place in the tables: mean, deviation over seeds and the sign of an improvement."""
+    """Return our number of a place in the tables: mean, deviation over seeds and the sign of an improvement.
+
+    A mean over the estimators is of the seeds that all of them have.
+    """
     families = analysis.results.families if family == MEAN else (family,)
-    scores = [analysis.scores(dataset, variant, name, metric) for name in families]
-    scores = [part for part in scores if len(part)]
-    if not scores or (family == MEAN and len(scores) < len(families)):
+    seeds = analysis.common_seeds(dataset, variant, families)
+    scores = [analysis.scores(dataset, variant, name, metric, seeds=seeds) for name in families] if seeds else []
+    if not scores or not all(len(part) for part in scores):
         return "-"
     digits = 0 if metric == "mae" and abs(float(np.mean(scores[0]))) >= 100 else 2
     known = [part[np.isfinite(part)] for part in scores]
@@ -353,17 +330,24 @@ def _method(variant: str) -> str:
 def _notes(analysis: Analysis, datasets: dict[str, str | None], *, signs: bool = True) -> str:
     """Return what a caption must say: seeds, setting, budget, stand-ins, and what means and `SIGNS` are."""
     there = [name for name in datasets.values() if name is not None]
-    seeds: dict[str, set[int]] = {}
-    for cell in analysis.results.cells:
-        if cell.dataset in there and not cell.failed:
-            seeds.setdefault(cell.variant, set()).add(cell.seed)
-    most = max((len(part) for part in seeds.values()), default=0)
-    fewer = ", ".join(f"{len(part)} for {name}" for name, part in seeds.items() if len(part) < most)
+    seeds = _fewest_seeds(analysis, there)
+    most = max(seeds.values(), default=0)
+    fewer = ", ".join(f"{count} for {name}" for name, count in seeds.items() if count < most)
     text = f"{most} seeds{f' ({fewer})' if fewer else ''}{', mean ± standard deviation' if signs else ''}; "
+    text += "rows of other seeds are compared by the seeds that they share; " if signs and fewer else ""
     text += f"{analysis.results.setting.describe()}; {'; '.join(budget_lines(analysis.results))}."
     text += " + or - : better or worse than no augmentation, 95% interval excludes zero." if signs else ""
     stand_ins = stand_ins_of(there)
     return text + (f" Stand-ins, not the paper's data: {', '.join(stand_ins)}." if stand_ins else "")
+
+
+def _fewest_seeds(analysis: Analysis, datasets: Sequence[str]) -> dict[str, int]:
+    """Return the number of seeds of each variant, on that of its datasets where it has the fewest."""
+    counts: dict[str, dict[str, set[int]]] = {}
+    for cell in analysis.results.cells:
+        if cell.dataset in datasets and not cell.failed:
+            counts.setdefault(cell.variant, {}).setdefault(cell.dataset, set()).add(cell.seed)
+    return {name: min(map(len, found.values())) for name, found in counts.items()}
 
 
 def budget_lines(results: Results) -> list[str]:
@@ -376,14 +360,3 @@ def budget_lines(results: Results) -> list[str]:
 def stand_ins_of(datasets: Sequence[str]) -> list[str]:
     """Return the datasets that stand in for the paper's: cloned from an expert's roll-outs, not from people's."""
     return [name for name in datasets if name.endswith("-from-expert")]
-
-
-def format_number(value: float) -> str:
-    """Return a number with about three digits, "-" for NaN.
-
-    >>> format_number(1234.5), format_number(0.1234), format_number(float("nan"))
-    ('1234', '0.123', '-')
-    """
-    if not math.isfinite(value):
-        return "-"
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

@@ -16,13 +16,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from oat_gym.benchmark.analysis import Analysis
 from oat_gym.benchmark.budget import BUDGETS, Budget
+from oat_gym.benchmark.grid import write_tables
 from oat_gym.benchmark.job import JobReport
 from oat_gym.benchmark.plan import Plan, make_plan, read_manifests, write_manifest
 from oat_gym.benchmark.protocol import SUITES, Question, Suite, find_suite
 from oat_gym.benchmark.results import Results, read_results, write_tidy
 from oat_gym.benchmark.runner import Listener, Pace, format_seconds, run
 from oat_gym.benchmark.story import best_sentences, groups_of
-from oat_gym.benchmark.tables import all_tables, write_tables
+from oat_gym.benchmark.tables import all_tables
 from oat_gym.benchmark.variants import VARIANTS, Variant, find_variant, parse_variants
 from oat_gym.cli._shared import check_choice, out
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError

@@ -229,6 +229,13 @@ DATASETS: dict[str, Callable[[], minari.MinariDataset]] = {TASK: umaze_d4rl}
 """Name of each dataset and the function that opens it."""
 
 TASKS: dict[str, Task] = {
-    TASK: Task(datasets=(TASK,), policies=_policies, truth=truth, initial_states=initial_states, horizon=HORIZON)
+    TASK: Task(
+        datasets=(TASK,),
+        policies=_policies,
+        truth=truth,
+        initial_states=initial_states,
+        horizon=HORIZON,
+        episodes_of="maze2d-umaze",
+    )
 }
 """Name of each task and what its datasets are evaluated with."""

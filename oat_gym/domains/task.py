@@ -23,6 +23,8 @@ class Task:
         gamma: the discount that the task is usually evaluated at.
         horizon: number of steps that the true values count; `None` for endless.
         paper: name of the paper's task that this one repeats or stands in for, as "door" ("" for none).
+        episodes_of: name of the task whose recorded episodes its datasets hold in another form ("": of no other), so
+            that results of both are not independent.
     """
 
     datasets: tuple[str, ...]
@@ -32,3 +34,4 @@ class Task:
     gamma: float = 0.995
     horizon: int | None = None
     paper: str = ""
+    episodes_of: str = ""

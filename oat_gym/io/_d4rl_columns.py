@@ -122,8 +122,9 @@ def _check_seams(data: MinariDataset) -> None:
     storage = data.storage
     if isinstance(storage, AugmentedStorage) and any(storage.next_states(int(n)) for n in data.episode_indices):
         raise InvalidDataError(
-            "Some transitions (literal seams, permuted segments) have a next state of their own, where readers of D4RL's "
-            "layout take the next row's observation. Use seam='contiguous' or 'matched', another method, or transitions()."
+            "Some transitions (literal seams, permuted segments) have a next state of their own, where readers of "
+            "D4RL's layout take the next row's observation. Use seam='contiguous' or 'matched', another method, or "
+            "transitions()."
         )
 
 

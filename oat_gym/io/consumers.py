@@ -175,7 +175,7 @@ def _check_contiguous(steps: dict[str, npt.NDArray[Any]]) -> None:
         raise InvalidDataError(
             f"{len(seams)} transitions, the first at step {steps['step'][seams[0]]} of episode "
             f"{steps['episode'][seams[0]]}, keep their own next state (literal seams, permuted segments), which "
-            "d3rlpy's format cannot hold. Use seam='contiguous' or 'matched', another method, or to_torch or to_torchrl."
+            "d3rlpy's format cannot hold. Use seam='contiguous' or 'matched', another method, to_torch or to_torchrl."
         )
 
 

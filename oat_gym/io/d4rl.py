@@ -164,8 +164,8 @@ def write_d4rl(data: MinariDataset, path: str | os.PathLike[str]) -> Path:
         DatasetExistsError: if `path` exists; it is left as it is.
         UnsupportedSpaceError: for Dict, Tuple, Text and other spaces that are not one array a step.
         InvalidDataError: for what the layout cannot hold: no episodes, NaN, a truncation before an episode's last
-            step, next states that are no observation, dtypes that differ between episodes (but integer rewards beside generated ones become
-            floats), infos of other lengths, or values outside their spaces.
+            step, next states that are no observation, dtypes that differ between episodes (but integers recorded for
+            real numbers become floats beside generated ones), infos of other lengths, or values outside their spaces.
         ConfigurationError: if the folder of `path` is not there.
         SaveError: if the disk refuses; nothing is left behind.
 

@@ -178,6 +178,14 @@ def test_scores_of_many_rows_are_those_of_ope_metrics(metric: Metric) -> None:
     assert score(rows[0, 0], true, metric) == pytest.approx(expected[0, 0])  # a single row
 
 
+def test_regrets_that_few_resamples_define_are_no_evidence() -> None:
+    """Regret@5 of six policies: a resample has six different ones in one of 65 draws."""
+    true = np.arange(6.0)
+    sides = [np.tile(order, (3, 1)) for order in (true[::-1], true)]
+    change = _improve(true, *[(each, np.repeat(each[..., None], B, axis=2)) for each in sides], "regret_at_5")
+    assert change.value > 0 and change.verdict == "no evidence" and change.parts.main == "policies"
+
+
 @pytest.mark.parametrize("metric", METRICS)
 def test_resampled_scores_are_scores_of_the_resample(metric: Metric) -> None:
     rng = np.random.default_rng(1)
@@ -189,8 +197,8 @@ def test_resampled_scores_are_scores_of_the_resample(metric: Metric) -> None:
         k = {"regret_at_1": 1, "regret_at_5": 5}.get(metric)
         if k is None:
             expected = score(rows[:, drawn], true[drawn], metric)
-        elif len(members) < k:
-            continue
+        elif k > 1 and len(members) <= k:
+            expected = [np.nan] * len(rows)
         else:
             expected = [metrics.regret_at_k(row[members], true[members], k, convention="raw") for row in rows]
         np.testing.assert_allclose(got[r], expected, atol=1e-12)

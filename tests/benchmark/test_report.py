@@ -1,5 +1,6 @@
 """From cells to tables, figures and the page: numbers that are known beforehand come out where they belong."""
 
+import dataclasses
 import math
 import re
 import time
@@ -11,9 +12,11 @@ import pytest
 
 from oat_gym.benchmark import figures, paper
 from oat_gym.benchmark.analysis import Analysis
+from oat_gym.benchmark.grid import write_tables
+from oat_gym.benchmark.improvement import Parts
 from oat_gym.benchmark.page import make_page
 from oat_gym.benchmark.protocol import Question
-from oat_gym.benchmark.results import Results, Setting, cell_rows, estimate_rows, to_csv, write_tidy
+from oat_gym.benchmark.results import Results, Setting, cell_rows, estimate_rows, to_csv, with_truth, write_tidy
 from oat_gym.benchmark.scores import METRICS
 from oat_gym.benchmark.store import CellResult, read_result, write_result
 from oat_gym.benchmark.story import (
@@ -25,7 +28,7 @@ from oat_gym.benchmark.story import (
     level_panels,
     sentence,
 )
-from oat_gym.benchmark.tables import all_tables, dataset_table, help_table, overview_table, paper_table, write_tables
+from oat_gym.benchmark.tables import all_tables, dataset_table, help_table, overview_table, paper_table
 from oat_gym.errors import CacheError, ConfigurationError
 
 POLICIES = tuple(f"p{number}" for number in range(7))
@@ -217,7 +220,7 @@ def test_the_overview_has_every_dataset_and_counts_verdicts() -> None:
     )
     table = overview_table(Analysis(Results(whole.setting, kept, whole.manifests, ())), "mae")
     rows = {row[0]: dict(zip(table.header[1:], row[1:], strict=True)) for row in table.rows}
-    assert table.header == ("variant", "over all", "helps on", "hurts on", "adroit-door-human", "line")
+    assert table.header == ("variant", "over all", "another task", "helps on", "hurts on", "adroit-door-human", "line")
     assert rows["scaling"]["over all"] == rows["scaling"]["adroit-door-human"]  # of the one that was measured
     assert rows["jittering"]["over all"] == rows["jittering"]["adroit-door-human"]  # one seed does not count
     counts = {name: (row["helps on"], row["hurts on"]) for name, row in rows.items()}
@@ -227,7 +230,7 @@ def test_the_overview_has_every_dataset_and_counts_verdicts() -> None:
     assert rows["jittering"]["line"].endswith("(one seed)")
     assert overview_table(Analysis(results_of({"line": True})), "mae") is None
     against = overview_table(Analysis(whole), "mae", baseline="oat-paper")
-    assert against.header[2:4] == ("better on", "worse on") and {row[0] for row in against.rows} == {
+    assert against.header[3:5] == ("better on", "worse on") and {row[0] for row in against.rows} == {
         "jittering",
         "scaling",
     }
@@ -243,6 +246,46 @@ def test_datasets_of_one_task_count_as_one() -> None:
     assert whole.over_all("oat", "mean", "mae") is None
     some = whole.over_all("oat-paper", "FQE", "mae", datasets=["adroit-door-expert"])
     assert some.improvement == whole.finding("adroit-door-expert", "oat-paper", "FQE", "mae").improvement
+
+
+def test_the_mean_over_tasks_is_told_for_these_and_for_another(analysis: Analysis) -> None:
+    """The second interval is of how much the tasks differ; tasks that share recorded episodes are one."""
+    found = results_of({"adroit-door-human": True, "maze2d-umaze": True, "maze2d-umaze-d4rl": True})
+    cells = (dataclasses.replace(part, task=part.dataset) for part in found.cells)
+    whole = Analysis(dataclasses.replace(found, cells=tuple(cells)))
+    these = whole.over_all("oat-paper", "FQE", "mae").improvement
+    another = whole.over_all("oat-paper", "FQE", "mae", between=True).improvement
+    assert another.value == pytest.approx(these.value)
+    assert another.degrees == 1  # door and maze: two tasks
+    assert another.parts.policies == another.parts.seeds == 0
+    alone = analysis.over_all("oat-paper", "FQE", "mae", between=True).improvement
+    assert math.isnan(alone.low) and alone.verdict == "no evidence"
+
+
+def test_a_mean_over_estimators_is_of_the_seeds_that_all_have() -> None:
+    whole = results_of({"adroit-door-human": True})
+    far = cell("adroit-door-human", "oat-paper", "FQE", 3, error=9000.0)  # IS of this seed was not finished
+    table = dataset_table(Analysis(results_of({"adroit-door-human": True}, extra=(far,))), "adroit-door-human")
+    without = dataset_table(Analysis(whole), "adroit-door-human")
+    rows, expected = ({row[:2]: row[2:] for row in part.rows} for part in (table, without))
+    assert rows["mean", "oat-paper"] == expected["mean", "oat-paper"]
+    assert rows["FQE", "oat-paper"] != expected["FQE", "oat-paper"]
+    assert "4 seeds (3 for none, 3 for jittering, 3 for scaling)" in table.caption
+
+
+def test_what_cannot_change_is_uncertain_by_nothing(analysis: Analysis) -> None:
+    one = analysis.finding("adroit-door-human", "oat-paper", "FQE", "mae").improvement
+    same = dataclasses.replace(one, parts=Parts(0.0, 0.0, 0.0, 0.0))
+    assert (same.parts.main, same.decides, one.decides) == ("-", False, True)
+    assert not dataclasses.replace(one, n_seeds=1).decides
+
+
+def test_a_policy_without_a_true_value_leaves_the_dataset_without_errors(tmp_path: Path) -> None:
+    member = cell("adroit-door-human", "none", "FQE", 0, error=3.0)
+    truths = {"adroit-door-human": {name: [1.0, 0.1] for name in member.policies[1:]}}
+    manifest = {"grounds": {"adroit-door-human": member.record["config"]["ground"]}, "truths": truths}
+    (known,) = with_truth([member], [manifest])
+    assert not known.knows_truth and np.isfinite(known.true[1:]).all()
 
 
 def test_tidy_rows_keep_every_number(analysis: Analysis, tmp_path: Path) -> None:

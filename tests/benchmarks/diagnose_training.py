@@ -31,12 +31,12 @@ from oat_gym import domains
 from oat_gym.augmenters import Jittering
 from oat_gym.benchmark.analysis import Analysis
 from oat_gym.benchmark.budget import BUDGETS, Budget
+from oat_gym.benchmark.grid import Table, write_tables
 from oat_gym.benchmark.plan import Plan, make_plan, write_manifest
 from oat_gym.benchmark.protocol import Catalog, Question, Suite
 from oat_gym.benchmark.results import Results, read_results
 from oat_gym.benchmark.runner import run
 from oat_gym.benchmark.scores import METRICS
-from oat_gym.benchmark.tables import Table, write_tables
 from oat_gym.benchmark.variants import NONE, VARIANTS, Variant
 
 JITTERS = (0.03, 0.1, 0.3)
