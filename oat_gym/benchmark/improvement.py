@@ -29,7 +29,7 @@ crossed, and what they do together is counted in both terms: the interval is sli
 that reason (Owen, 2007, "The pigeonhole bootstrap"). Tasks are independent: variances add, divided by their number
 squared. Datasets of one task are not, they share its policies: standard errors add, divided by their number.
 
-**What it covers.** In the experiments of `tests/benchmark/test_improvement.py`, where a method changes nothing, 4 to 8%
+**What it covers.** In the experiments of `tests/benchmark/test_improvement.py`, where a method changes nothing, 5 to 8%
 of the 95% intervals of errors exclude zero with three seeds, and hardly any of ranks and regrets, whose terms
 overlap: "no evidence" is also said of some changes of them that are there.
 

@@ -1,6 +1,7 @@
 """What is known of the numbers of `diagnose_steps.py` before they are computed, and that the script goes on."""
 
 import csv
+import dataclasses
 import importlib.util
 import subprocess
 import sys
@@ -13,9 +14,16 @@ from gymnasium import spaces
 from minari import MinariDataset
 
 from oat_gym import AugmentedDataset, Function, Jittering, Scaling, domains
+from oat_gym.benchmark.grid import format_number
+from oat_gym.benchmark.plan import make_plan, write_manifest
+from oat_gym.benchmark.protocol import Question
+from oat_gym.benchmark.results import read_results
+from oat_gym.benchmark.runner import run
+from oat_gym.benchmark.variants import parse_variants
 from oat_gym.metrics.steps import Scale, Steps
 from oat_gym.ope import PolicySet
 from oat_gym.spaces import FlatSpace
+from tests.benchmark import tiny
 
 SCRIPT = Path(__file__).with_name("diagnose_steps.py")
 
@@ -143,3 +151,25 @@ def test_ends_that_are_generated_are_counted_with_their_rewards(tmp_path: Path) 
         told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     assert not told
     assert len((tmp_path / "ends.csv").read_text().splitlines()) == 4
+
+
+def test_estimates_are_kept_within_what_policies_can_earn(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location("diagnose_range", SCRIPT.with_name("diagnose_range.py"))
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    budget = dataclasses.replace(tiny.BUDGET, estimators=tiny.BUDGET.estimators[:1])
+    settings = {"question": Question(resamples=20, resets=5), "budget": budget, "catalog": tiny.CATALOG}
+    plan = make_plan(tiny.SUITE, parse_variants("jittering"), seeds=(0, 1), **settings)
+    write_manifest(tmp_path, plan, seeds=(0, 1), device="cpu", command="bench")
+    run(plan, tmp_path, catalog=tiny.CATALOG)
+    (results,) = read_results(tmp_path)
+    true, family = results.cells[0].true, results.families[0]
+    module.OUTCOMES = {name: (true.mean(), true.mean()) for name in results.datasets}
+    module.FAMILIES = (family,)
+    *rows, whole = module.rows_of(tmp_path, ["jittering"])
+    off = float(np.abs(true - true.mean()).mean())
+    assert all(row["error within"] == format_number(off) and row["error"] != row["error within"] for row in rows)
+    assert all(row["jittering within"] == "0 (0 to 0)" for row in (*rows, whole))  # one value is left for all
+    module.write(tmp_path, [*rows, whole])
+    assert len((tmp_path / "range.csv").read_text().splitlines()) == len(rows) + 2
