@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from oat_gym import _ids
 from oat_gym.errors import ConfigurationError, DatasetExistsError, InvalidDataError, SaveError
 from oat_gym.io import writing
 from oat_gym.io.writing import DatasetCard, dataset_from_episodes, episode_buffer
@@ -194,4 +195,4 @@ def test_no_episodes_and_no_version_are_refused(tmp_path):
 
 
 def test_examples_in_docstrings():
-    assert doctest.testmod(writing).failed == 0
+    assert doctest.testmod(writing).failed == doctest.testmod(_ids).failed == 0
