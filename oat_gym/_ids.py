@@ -6,14 +6,14 @@ import difflib
 from collections.abc import Iterable
 
 
-def describe_ids(wrong: str) -> str:
+def describe_ids(wrong: object) -> str:
     """Return the form of a Minari id, with the rule that `wrong` breaks although it looks right.
 
     >>> describe_ids("x/log-v0")
     "namespace/name-v0, with two characters or more in the namespace, and 'x' has one"
     """
     form = "namespace/name-v0"
-    namespace, slash, _ = wrong.rpartition("/")
+    namespace, slash, _ = wrong.rpartition("/") if isinstance(wrong, str) else ("", "", "")
     if slash and len(namespace) == 1:
         return f"{form}, with two characters or more in the namespace, and {namespace!r} has one"
     return f"{form} (the namespace may be left out)"
