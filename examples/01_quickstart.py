@@ -10,9 +10,6 @@ import oat_gym
 from oat_gym import OAT, MiningConfig
 from oat_gym.generation import BehaviorConfig, VAEMDPConfig
 
-# Only for this example: keep what it saves out of your own Minari datasets.
-os.environ["MINARI_DATASETS_PATH"] = tempfile.mkdtemp()
-
 real = oat_gym.domains.load("maze2d-umaze")
 config = OAT(
     mining=MiningConfig(n_clusters=5, length=15, top=2, switch_penalty=20.0, init="kmeans"),
@@ -32,5 +29,8 @@ print(f"episode {len(real) + 3} is episode {origin.source} with generated spans 
 columns = data.transitions()
 print(f"{len(columns)} transitions, {columns.synthetic.mean():.1%} of them generated")
 
-saved = data.save("example/maze-oat-v0")
-print(f"saved {len(saved)} episodes as {saved.id}")
+# A temporary folder, only for this example: your own Minari datasets are where `save` otherwise writes.
+with tempfile.TemporaryDirectory() as folder:
+    os.environ["MINARI_DATASETS_PATH"] = folder
+    saved = data.save("example/maze-oat-v0")
+    print(f"saved {len(saved)} episodes as {saved.id}")

@@ -7,8 +7,6 @@ import os
 import pickle
 import tempfile
 
-os.environ["MINARI_DATASETS_PATH"] = tempfile.mkdtemp()
-
 import minari
 import numpy as np
 
@@ -60,4 +58,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["MINARI_DATASETS_PATH"] = folder
+        main()

@@ -7,8 +7,6 @@ import os
 import tempfile
 import warnings
 
-os.environ["MINARI_DATASETS_PATH"] = tempfile.mkdtemp()
-
 import minari
 import numpy as np
 from gymnasium import spaces
@@ -76,4 +74,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["MINARI_DATASETS_PATH"] = folder
+        main()

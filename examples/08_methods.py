@@ -7,8 +7,6 @@ import dataclasses
 import os
 import tempfile
 
-os.environ["OAT_GYM_CACHE"] = tempfile.mkdtemp()
-
 import numpy as np
 from minari import EpisodeData
 
@@ -57,4 +55,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["OAT_GYM_CACHE"] = folder
+        main()

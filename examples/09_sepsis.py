@@ -9,8 +9,6 @@ import os
 import sys
 import tempfile
 
-os.environ["MINARI_DATASETS_PATH"] = tempfile.mkdtemp()
-
 import numpy as np
 
 from oat_gym import ope
@@ -50,4 +48,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["MINARI_DATASETS_PATH"] = folder
+        main()

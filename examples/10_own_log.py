@@ -8,8 +8,6 @@ import os
 import tempfile
 from pathlib import Path
 
-os.environ["OAT_GYM_CACHE"] = tempfile.mkdtemp()
-
 import numpy as np
 import pandas as pd
 from gymnasium import spaces
@@ -73,4 +71,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["OAT_GYM_CACHE"] = folder
+        main()

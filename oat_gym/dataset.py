@@ -86,7 +86,11 @@ class AugmentedDataset(MinariDataset):
         if isinstance(source, str | PathLike):
             source = find_source(source)
         if not isinstance(source, MinariDataset):
-            raise ConfigurationError(f"The source must be a Minari dataset or the id of one, got {source!r}.")
+            raise ConfigurationError(
+                "The source must be a Minari dataset, the id of one or the path of a D4RL file, got a "
+                f"{type(source).__name__}. Make a dataset of episodes with oat_gym.io.writing.dataset_from_episodes, "
+                "of a table with oat_gym.io.tables.episodes_from_table first."
+            )
         if augmenter is None:
             augmenter = OAT()
         if not isinstance(augmenter, Augmenter):

@@ -13,6 +13,20 @@ class InvalidDataError(OatGymError, ValueError):
     """The data breaks a rule of the method: NaN, an empty dataset, lengths that do not agree."""
 
 
+class ShortEpisodesError(InvalidDataError):
+    """No episode has room for a sub-trajectory: `finding` says so, and `length` would leave room (0: none would)."""
+
+    def __init__(self, finding: str, length: int, advice: str) -> None:
+        super().__init__(finding, length, advice)  # all of them, so that it can be pickled
+        self.finding = finding
+        self.length = length
+        self.advice = advice
+
+    def __str__(self) -> str:
+        """Return the finding with the advice that fits a call from Python."""
+        return f"{self.finding} {self.advice}"
+
+
 class UnsupportedSpaceError(OatGymError, TypeError):
     """A Gymnasium space that the chosen method cannot model; the message names the space."""
 

@@ -21,6 +21,7 @@ from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
 from minari.namespace import NAMESPACE_METADATA_FILENAME
 from minari.storage import get_dataset_path
 
+from oat_gym._ids import describe_ids
 from oat_gym._staging import owned_folder
 from oat_gym.cache import write_atomically
 from oat_gym.episodes import plain_infos
@@ -68,7 +69,7 @@ def check_dataset_id(dataset_id: str) -> Path:
         parse_dataset_id(dataset_id)
     except (TypeError, ValueError) as error:
         raise ConfigurationError(
-            f"{dataset_id!r} is no dataset id: expected (namespace/)name-v(version), for example 'door/human-oat-v0'."
+            f"{dataset_id!r} is no dataset id: expected the form {describe_ids(dataset_id)}."
         ) from error
     try:
         path = get_dataset_path(dataset_id)

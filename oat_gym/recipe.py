@@ -21,6 +21,7 @@ from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
 from minari.serialization import deserialize_space
 from minari.storage import get_dataset_path
 
+from oat_gym._ids import describe_ids
 from oat_gym.augmenters import AUGMENTERS
 from oat_gym.augmenters._parts import methods_in
 from oat_gym.augmenters.base import Augmenter
@@ -80,7 +81,7 @@ def find_dataset(name: str) -> MinariDataset:
         data_path = get_dataset_path(name) / "data"
         exists = data_path.exists()
     except (OSError, TypeError, ValueError) as error:
-        raise ConfigurationError(f"{name!r} is no dataset id of the form namespace/name-v0.") from error
+        raise ConfigurationError(f"{name!r} is no dataset id: expected the form {describe_ids(name)}.") from error
     if exists:
         return _load(name, data_path)
     if name in EMBEDDED:
@@ -115,8 +116,9 @@ def write_recipe(synthesis: Synthesis) -> bytes:
     for method in reversed([*methods_in(augmenter)]):  # the parts before what is made of them
         if METHODS.get(method.name) is not type(method) or not method.cacheable:
             raise ConfigurationError(
-                f"A recipe names methods of oat_gym.AUGMENTERS ({', '.join(METHODS)}), and {method!r} is not one: "
-                "save the episodes themselves (lazy=False)."
+                f"A recipe names methods of oat_gym.AUGMENTERS ({', '.join(AUGMENTERS)}), alone or in Compose and "
+                f"Mixture, by settings that JSON holds, and {method!r} is not one: save the episodes themselves "
+                "(lazy=False)."
             )
     try:
         found = find_dataset(dataset.id)

@@ -9,11 +9,13 @@ from pathlib import Path
 
 import minari
 import pytest
+from gymnasium import spaces
 from typer.testing import CliRunner
 
 from oat_gym import AUGMENTERS, OAT, AugmentedDataset, MiningConfig, cli, metrics
-from oat_gym.errors import AugmentationWarning, ConfigurationError
+from oat_gym.errors import AugmentationWarning, ConfigurationError, SaveError
 from oat_gym.generation import BehaviorConfig, VAEMDPConfig
+from tests.conftest import install_dataset, walks
 
 
 def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -51,6 +53,12 @@ def test_help(command: list[str]) -> None:
         (["compare", "maze2d-umaze", "--augmenters", "tda,oat,tda"], "names a method twice"),
         (["compare", "maze2d-umaze", "--factor", "1"], "--factor must be more than 1"),
         (["magic"], "No such command"),
+        (["inspect", "maze2d-umze"], "Did you mean 'maze2d-umaze'?"),
+        (["inspect", "oat_gym/maze2d-umze-v0"], "Did you mean 'oat_gym/maze2d-umaze-v0'?"),
+        (["inspect", "x"], "The names are adroit-door-cloned"),
+        (["inspect", "maze2d-umaze", "--length", "x"], "--length"),
+        (["augment", "maze2d-umaze", "--length", "1000"], "Use --length 28 or --length auto."),
+        (["augment", "maze2d-umaze", "--augmenter", "tda", "--length", "1000"], "Use --length 28."),
         (["demo", "--factor", "1"], "--factor must be more than 1"),
     ],
 )
@@ -100,6 +108,67 @@ def test_inspect_shows_a_plain_and_an_augmented_dataset(
     assert result.returncode == 0, result.stderr
     for words in ("synthetic", "seam in (sd)", "support", "PST set"):
         assert words in result.stdout
+
+
+def short_episodes() -> minari.MinariDataset:
+    return install_dataset("test/short-v0", walks(6, 8), spaces.Box(-100, 100, (2,)), spaces.Box(-1, 1, (2,)))
+
+
+def test_inspect_of_short_episodes_says_that_nothing_was_mined(tmp_path: Path) -> None:
+    short_episodes()
+    result = run("inspect", "test/short-v0", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "episodes" in result.stdout
+    assert "Not mined. No episode is as long as a sub-trajectory of 20 steps" in result.stdout
+    assert result.stdout.rstrip().endswith("Use --length 4.")
+    assert "MiningConfig" not in result.stdout + result.stderr
+
+
+def test_episodes_of_a_source_that_is_augmented_are_not_called_real(walk_dataset: minari.MinariDataset) -> None:
+    AugmentedDataset(walk_dataset, AUGMENTERS["jittering"](), factor=2).save("test/more-v0")
+    arguments = ["augment", "test/more-v0", "--augmenter", "jittering", "--factor", "2", "--out", "test/most-v0"]
+    result = CliRunner().invoke(cli.app, arguments)
+    assert "test/most-v0: 24 of the source + 24 synthetic episodes." in result.output
+
+
+def test_help_is_short() -> None:
+    assert "icu-sepsis" not in CliRunner().invoke(cli.app, ["augment", "--help"]).output
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["demo"],
+        ["compare", "maze2d-umaze", "--augmenters", "jittering"],
+        ["bench"],
+        ["evaluate", "maze2d-umaze", "--estimators", "is"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_where_nothing_can_be_written_it_is_said_before_the_work(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+
+    def work(*_: object, **__: object) -> None:
+        raise AssertionError("this is work")
+
+    for place in ("metrics.compare", "ope.evaluate", "cli.demo.AugmentedDataset.fit", "cli.bench.make_plan"):
+        monkeypatch.setattr(f"oat_gym.{place}", work)
+    result = CliRunner().invoke(cli.app, [*command, "--out", str(tmp_path / "file" / "inside")])
+    assert isinstance(result.exception, SaveError), result.output
+    assert "--out" in str(result.exception)
+    assert "cannot be written: the folder" in str(result.exception)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_file_in_the_place_of_a_folder_and_the_other_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    result = CliRunner().invoke(cli.app, ["demo", "--out", "file"])
+    assert "--out must be a folder, and 'file' is a file" in str(result.exception)
+    result = CliRunner().invoke(cli.app, ["evaluate", "maze2d-umaze", "--estimators", "is", "--out", str(tmp_path)])
+    assert "--out must be a file" in str(result.exception)
 
 
 def test_augment_saves_what_the_library_makes(

@@ -131,6 +131,7 @@ def test_estimates_are_kept_where_no_true_value_is_known(
     [
         (["--estimators", "magic"], ConfigurationError, "no estimator 'magic'"),
         (["--use-augmented", "half"], ConfigurationError, "--use-augmented must be one of"),
+        (["--seeds", "0"], ConfigurationError, "--seeds must be at least 1, got 0"),
         (["--behavior", "guess"], ConfigurationError, "--behavior must be one of clone, logged"),
         (["--augmenter", "magic"], ConfigurationError, "no augmenter 'magic'"),
         (["--gamma", "1.5", "--policies", "POLICIES"], ConfigurationError, "gamma must be"),

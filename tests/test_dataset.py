@@ -95,6 +95,7 @@ def test_factor_and_count(make_dataset: MakeDataset, kwargs: dict[str, float], c
         ({"seed": 1.5}, "seed must be a non-negative integer"),
         ({"augmenter": "oat"}, "augmenter must be"),
         ({"source": 3}, "source must be"),
+        ({"source": [{"name": "J. Doe"}]}, r"got a list. Make a dataset of episodes with .{,140}$"),
         ({"source": "nowhere"}, "no dataset id"),
         ({"source": "nowhere/none-v0"}, "minari download nowhere/none-v0"),
     ],

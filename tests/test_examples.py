@@ -1,5 +1,6 @@
 """Every example runs, and stays short."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,17 @@ EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
 def test_example(path: Path, tmp_path: Path) -> None:
     assert len(path.read_text().splitlines()) < 80
-    run = subprocess.run([sys.executable, str(path)], cwd=tmp_path, capture_output=True, text=True, check=False)
+    here, temporary = tmp_path / "here", tmp_path / "temporary"
+    here.mkdir()
+    temporary.mkdir()
+    run = subprocess.run(
+        [sys.executable, str(path)],
+        cwd=here,
+        env={**os.environ, "TMPDIR": str(temporary)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert run.returncode == 0, run.stderr
     assert run.stdout
-    assert list(tmp_path.iterdir()) == []
+    assert [*here.iterdir(), *temporary.iterdir()] == []

@@ -205,6 +205,8 @@ def test_a_dataset_that_exists_is_refused_before_any_work(make_dataset: MakeData
     for wrong in ("no version", "test/nothing", "../escape-v0"):
         with pytest.raises(ConfigurationError, match="is no dataset id"):
             data.save(wrong, lazy=lazy)
+    with pytest.raises(ConfigurationError, match="two characters or more in the namespace, and 'x' has one"):
+        data.save("x/h5-v0", lazy=lazy)
     with pytest.raises(ConfigurationError, match="data_format"):
         data.save("test/new-v0", data_format="csv")
 

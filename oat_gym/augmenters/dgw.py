@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -26,12 +26,11 @@ from oat_gym.augmenters.series import (
 from oat_gym.cache import Arrays
 from oat_gym.dtw import dtw, dtw_path
 from oat_gym.episodes import IntArray
+from oat_gym.errors import AugmentationWarning
 from oat_gym.progress import ProgressCallback, silent
 from oat_gym.source import Source
 from oat_gym.spaces import FloatMatrix, Layout
 from oat_gym.stitching import Span
-
-_log = logging.getLogger(__name__)
 
 _KEPT_DISTANCES = 2**17
 
@@ -51,7 +50,7 @@ class DGW(Augmenter):
     reference. The episode's rows are put in the order of the DTW path between the two and brought back to its own
     length; of these a window is sliced and brought back to that length too. The window holds `slice_ratio` of the
     steps where nothing was warped, and more the more was warped, up to all of them. With one class, or an
-    episode whose class has no other member, there is no reference and a window slice only (this is logged).
+    episode whose class has no other member, there is no reference and a window slice only (a warning tells it).
 
     In the authors' code an index within the class is never mapped back to the data, so that positives and negatives
     are episodes of any class. Here they are what the paper says. Other differences, all small: the two resamplings
@@ -115,11 +114,12 @@ class DGWSampler(Sampler):
         self._distances: dict[tuple[int, int], float] = {}
         alone = sum(not (len(same) and len(other)) for same, other in map(self.rivals, range(len(self.classes))))
         if alone:
-            _log.warning(
-                "%d of %d episodes have no other episode of their class, or none of another class, to be warped "
-                "towards: their variations are window slices only. `labels` sets the classes.",
-                alone,
-                len(self.classes),
+            warnings.warn(
+                f"{alone} of {len(self.classes)} episodes have no other episode of their class, or there is none of "
+                "another class: with no episode to be warped towards, their variations are window slices only. "
+                "`labels` sets the classes.",
+                AugmentationWarning,
+                stacklevel=3,
             )
 
     def rivals(self, i: int) -> tuple[IntArray, IntArray]:

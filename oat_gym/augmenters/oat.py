@@ -147,7 +147,7 @@ def _warn_of_copies(mining: MiningResult, n_source: int) -> None:
     _windows(mining).warn_of_copies(
         n_source,
         reason=f"hold no window of the PST sets (W={mining.length}; {mining.n_too_short} episodes have too few steps)",
-        advice="A smaller length, fewer clusters or more sets (top) reach more episodes.",
+        advice="More sets (top), fewer clusters or a smaller length reach more episodes.",
     )
 
 

@@ -26,7 +26,7 @@ from oat_gym.augmenters.generative import (
 from oat_gym.augmenters.spans import Occurrence, Placement, SpanSamples, place_spans, seam_jumps
 from oat_gym.cache import Arrays
 from oat_gym.episodes import IntArray
-from oat_gym.errors import AugmentationWarning, InvalidDataError
+from oat_gym.errors import AugmentationWarning, ShortEpisodesError
 from oat_gym.generation import Sequences, VAEMDPConfig
 from oat_gym.generation.config import check_integer
 from oat_gym.source import Source
@@ -69,13 +69,14 @@ class StitchingAugmenter(GenerativeAugmenter):
         return source.lengths - np.array(terminated, dtype=np.int64)
 
     def check_room(self, source: Source, length: int) -> None:
-        """Raise `InvalidDataError` unless spans of `length` steps may lie somewhere."""
+        """Raise `ShortEpisodesError` unless spans of `length` steps may lie somewhere."""
         usable = self.usable(source)
         if usable.max() < length:
-            raise InvalidDataError(
+            raise ShortEpisodesError(
                 f"No episode has the {length} steps of a sub-trajectory before the step in which it terminates, which "
-                f"stays as recorded: the {len(usable)} episodes have {usable.min()} to {usable.max()}. Use a shorter "
-                "length, or ends='generated' to generate terminations as other steps are."
+                f"stays as recorded: the {len(usable)} episodes have {usable.min()} to {usable.max()}.",
+                length=min(_half(usable), length - 1),
+                advice="Use a shorter length, or ends='generated' to generate terminations as other steps are.",
             )
 
     @classmethod
@@ -135,14 +136,19 @@ class Windows:
 
 
 def check_length(lengths: IntArray, length: int, *, advice: str) -> None:
-    """Raise `InvalidDataError` unless some episode has `length` steps; `advice` may name `{half}` the median length."""
+    """Raise `ShortEpisodesError` unless some episode has `length` steps; `advice` may name `{half}` the median."""
     if lengths.max() < length:
-        median = np.median(lengths)
-        raise InvalidDataError(
+        raise ShortEpisodesError(
             f"No episode is as long as a sub-trajectory of {length} steps: the {len(lengths)} episodes have "
-            f"{lengths.min()} to {lengths.max()} steps (median {median:g}). "
-            + advice.format(half=max(1, int(median) // 2))
+            f"{lengths.min()} to {lengths.max()} steps (median {np.median(lengths):g}).",
+            length=_half(lengths),
+            advice=advice.format(half=_half(lengths)),
         )
+
+
+def _half(lengths: IntArray) -> int:
+    """Return half of the median length, which leaves room in at least half of the episodes."""
+    return max(1, int(np.median(lengths)) // 2)
 
 
 class StitchedSampler(GenerativeSampler):

@@ -126,7 +126,7 @@ def check_augmenter(
     if not isinstance(augmenter, Augmenter):
         raise ConfigurationError(f"check_augmenter takes an oat_gym.Augmenter such as OAT(), got {augmenter!r}.")
     if dataset is not None and not isinstance(dataset, MinariDataset):
-        raise ConfigurationError(f"dataset must be a minari.MinariDataset or None, got {dataset!r}.")
+        raise ConfigurationError(f"dataset must be a minari.MinariDataset or None, got a {type(dataset).__name__}.")
     if limit is not None and limit < 1:
         raise ConfigurationError(f"limit must be at least 1, or None for every episode, got {limit!r}.")
     check_seed(seed)

@@ -101,7 +101,7 @@ def check_dataset(
     2
     """
     if not isinstance(dataset, MinariDataset):
-        raise ConfigurationError(f"check_dataset takes a minari.MinariDataset, got {dataset!r}.")
+        raise ConfigurationError(f"check_dataset takes a minari.MinariDataset, got a {type(dataset).__name__}.")
     if limit is not None and limit < 1:
         raise ConfigurationError(f"limit must be at least 1, or None for every episode, got {limit!r}.")
     if not set(formats) <= set(DATA_FORMATS):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+from collections.abc import Generator
 from typing import Annotated, Any
 
 import typer
@@ -10,23 +12,51 @@ from minari import MinariDataset
 from rich.console import Console
 
 from oat_gym import domains
+from oat_gym._ids import did_you_mean
 from oat_gym.augmenters import AUGMENTERS, Augmenter
 from oat_gym.dataset import find_source
-from oat_gym.errors import ConfigurationError
+from oat_gym.embedded import EMBEDDED
+from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError, ShortEpisodesError
+from oat_gym.io.d4rl import is_d4rl_path
 from oat_gym.mining import MiningConfig
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, add_completion=False)
 out = Console(highlight=False, soft_wrap=True)
 
-_NAMES = ", ".join(domains.DATASETS)
-Dataset = Annotated[str, typer.Argument(help=f"Id of a local Minari dataset, path of a D4RL file, or one of {_NAMES}.")]
+Dataset = Annotated[
+    str,
+    typer.Argument(help="Id of a local Minari dataset, path of a D4RL file, or a name of ours such as maze2d-umaze."),
+]
 Factor = Annotated[float, typer.Option(help="Episodes in all, as a multiple of the source's.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.")]
 
 
 def open_source(name: str) -> MinariDataset:
-    """Return the dataset of a name: one of `oat_gym.domains.DATASETS`, a local Minari id, or a D4RL file."""
-    return domains.load(name) if name in domains.DATASETS else find_source(name)
+    """Return the dataset of a name: one of `oat_gym.domains.DATASETS`, a local Minari id, or a D4RL file.
+
+    Raises:
+        ConfigurationError, DatasetNotFoundError: for any other name; the message has the one that may be meant.
+    """
+    if name in domains.DATASETS:
+        return domains.load(name)
+    try:
+        return find_source(name)
+    except (ConfigurationError, DatasetNotFoundError) as error:
+        near = did_you_mean(name, (*domains.DATASETS, *EMBEDDED))
+        if not near and "/" not in name and not is_d4rl_path(name):
+            near = f" The names are {', '.join(sorted(domains.DATASETS))}."
+        raise type(error)(f"{error}{near}") from error
+
+
+@contextlib.contextmanager
+def length_advice(advice: str) -> Generator[None]:
+    """Where no episode has room for a sub-trajectory, say `advice` (with a `{length}`) in place of a line of Python."""
+    try:
+        yield
+    except ShortEpisodesError as error:
+        if error.length < 1:
+            raise
+        raise InvalidDataError(f"{error.finding} {advice.format(length=error.length)}") from error
 
 
 def check_choice(option: str, value: str, choices: tuple[str, ...]) -> None:

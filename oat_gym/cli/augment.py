@@ -7,11 +7,12 @@ from typing import Annotated, Any
 import typer
 
 from oat_gym.augmenters import AUGMENTERS
-from oat_gym.cli._shared import Dataset, Factor, Seed, configure, open_source, out
+from oat_gym.cli._shared import Dataset, Factor, Seed, configure, length_advice, open_source, out
 from oat_gym.dataset import AugmentedDataset
 from oat_gym.errors import ConfigurationError
 from oat_gym.export import DATA_FORMATS, check_dataset_id
 from oat_gym.progress import progress_bar
+from oat_gym.report import real_episodes
 
 Method = Annotated[str, typer.Option("--augmenter", help=f"One of {', '.join(AUGMENTERS)}.")]
 Length = Annotated[
@@ -34,14 +35,17 @@ def augment(
     """Augment DATASET and save the result as a Minari dataset."""
     source = open_source(dataset)
     target = dataset_id or f"{source.spec.namespace or 'oat_gym'}/{source.spec.dataset_name}-{augmenter}-v0"
-    data = AugmentedDataset(source, configure(augmenter, length=length, top=top), factor=factor, seed=seed)
-    check_dataset_id(target)
-    chosen = _data_format(data_format)
-    if not lazy:
-        with progress_bar() as progress:
-            data.fit(progress=progress)
+    method = configure(augmenter, length=length, top=top)
+    with length_advice("Use --length {length}" + (" or --length auto." if augmenter == "oat" else ".")):
+        data = AugmentedDataset(source, method, factor=factor, seed=seed)
+        check_dataset_id(target)
+        chosen = _data_format(data_format)
+        if not lazy:
+            with progress_bar() as progress:
+                data.fit(progress=progress)
     saved = data.save(target, data_format=chosen, lazy=lazy)
-    out.print(f"{target}: {len(data.source)} real + {len(data) - len(data.source)} synthetic episodes.")
+    kind = "real" if len(real_episodes(source)) == len(source) else "of the source"
+    out.print(f"{target}: {len(source)} {kind} + {len(data) - len(source)} synthetic episodes.")
     out.print(f"Stored in {saved.storage.data_path}; load it with minari.load_dataset({target!r}).")
 
 

@@ -25,6 +25,7 @@ from oat_gym.benchmark.runner import Listener, Pace, format_seconds, run
 from oat_gym.benchmark.story import best_sentences, groups_of
 from oat_gym.benchmark.tables import all_tables
 from oat_gym.benchmark.variants import VARIANTS, Variant, find_variant, parse_variants
+from oat_gym.cli._output import prepare_folder
 from oat_gym.cli._shared import check_choice, out
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError
 
@@ -128,9 +129,7 @@ def _question(initial: str, behavior: str, gamma: float | None) -> Question:
 
 
 def _check_folder(folder: Path) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise ConfigurationError(f"--out must be a folder, and {str(folder)!r} is a file: give another name.")
-    folder.mkdir(parents=True, exist_ok=True)
+    prepare_folder(folder)
     if any((folder / "runs").glob("*.json")):
         read_manifests(folder)  # now, not after hours of computing
 

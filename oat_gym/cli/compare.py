@@ -13,6 +13,7 @@ from rich.table import Table
 from oat_gym import metrics, plots
 from oat_gym.augmenters import AUGMENTERS, Augmenter
 from oat_gym.cache import write_atomically
+from oat_gym.cli._output import prepare_folder
 from oat_gym.cli._shared import Dataset, Factor, Seed, find_augmenter, open_source, out
 from oat_gym.errors import ConfigurationError
 from oat_gym.metrics import METRICS, Comparison
@@ -41,9 +42,7 @@ def compare(
     source = open_source(dataset)
     if not factor > 1:
         raise ConfigurationError(f"Generated episodes are compared: --factor must be more than 1, got {factor:g}.")
-    if folder.exists() and not folder.is_dir():
-        raise ConfigurationError(f"--out must be a folder, and {str(folder)!r} is a file: give another name.")
-    folder.mkdir(parents=True, exist_ok=True)
+    prepare_folder(folder)
     with progress_bar() as progress:
         rows = metrics.compare(source, methods, factor=factor, seed=seed, progress=progress)
     stem = source.id.rpartition("/")[2]

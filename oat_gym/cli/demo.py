@@ -10,6 +10,7 @@ import typer
 
 from oat_gym import plots
 from oat_gym.augmenters.oat import OAT
+from oat_gym.cli._output import prepare_folder
 from oat_gym.cli._shared import Factor, Seed, out
 from oat_gym.cli._tables import print_mining
 from oat_gym.dataset import AugmentedDataset
@@ -45,6 +46,7 @@ def demo(
     data = AugmentedDataset(maze2d.umaze(), DEMO_CONFIG, factor=factor, seed=seed)
     if len(data) == len(data.source):
         raise ConfigurationError(f"The demo shows synthetic episodes: --factor must be more than 1, got {factor:g}.")
+    prepare_folder(folder)
     saved = _saved_demo(data)
     with progress_bar() as progress:
         data.fit(progress=progress)

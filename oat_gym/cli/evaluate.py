@@ -16,13 +16,15 @@ from rich.table import Table
 from oat_gym import domains, ope
 from oat_gym.augmenters import AUGMENTERS
 from oat_gym.cache import write_atomically
-from oat_gym.cli._shared import Dataset, Factor, Seed, check_choice, find_augmenter, open_source, out
+from oat_gym.cli._output import prepare_file
+from oat_gym.cli._shared import Dataset, Factor, Seed, check_choice, find_augmenter, length_advice, open_source, out
 from oat_gym.dataset import AugmentedDataset
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError
 from oat_gym.progress import progress_bar
 from oat_gym.spaces import Batch
 
 _RESETS = 200
+_LENGTH_ADVICE = "Use `oat-gym augment --length {length}` first, and evaluate what it writes."
 _PARTS: dict[str, ope.UseAugmented] = {"training": None, "all": "all", "none": "none"}
 
 
@@ -59,6 +61,8 @@ def evaluate(
     check_choice("--use-augmented", use_augmented, tuple(_PARTS))
     check_choice("--initial", initial, ("data", "reset"))
     check_choice("--behavior", behavior, ("clone", "logged"))
+    if seeds < 1:
+        raise ConfigurationError(f"--seeds must be at least 1, got {seeds}.")
     given = None if truth is None else read_truth(truth)
     data = _data(dataset, augmenter, factor, seed)
     targets, task = _targets(policies, dataset, data)
@@ -66,7 +70,9 @@ def evaluate(
     horizon = task.horizon if horizon is None and task else horizon
     starts = _initial_states(task) if initial == "reset" else None
     known = _known(given, task, list(targets), gamma=gamma, horizon=horizon)
-    with progress_bar() as progress:
+    if file is not None:
+        prepare_file(file)
+    with progress_bar() as progress, length_advice(_LENGTH_ADVICE):
         if isinstance(data, AugmentedDataset):
             data.fit(progress=progress)
         result = ope.evaluate(
@@ -208,7 +214,9 @@ def _data(dataset: str, augmenter: str, factor: float, seed: int) -> MinariDatas
     source = open_source(dataset)
     if augmenter == "none":
         return source
-    return AugmentedDataset(source, find_augmenter(augmenter), factor=factor, seed=seed)
+    method = find_augmenter(augmenter)
+    with length_advice(_LENGTH_ADVICE):
+        return AugmentedDataset(source, method, factor=factor, seed=seed)
 
 
 def _print_rows(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from oat_gym.benchmark.page import write_page
+from oat_gym.cli._output import prepare_file, prepare_folder
 from oat_gym.cli._shared import out
 from oat_gym.errors import ConfigurationError
 
@@ -27,5 +28,9 @@ def report(
         raise ConfigurationError(f"{str(folder)!r} is no folder of results: run `oat-gym bench --out {folder}` first.")
     if file is not None and file.is_dir():
         file /= "report.html"
-    page = write_page(folder, file or folder / "report.html", pictures=pictures)
+    file = file or folder / "report.html"
+    prepare_file(file)
+    if pictures is not None:
+        prepare_folder(pictures, option="--pictures")
+    page = write_page(folder, file, pictures=pictures)
     out.print(f"Report: {page}")

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import minari
 
+from oat_gym._ids import did_you_mean
 from oat_gym.domains import adroit, maze2d, sepsis, sepsis_sim, sepsis_tabular, tutoring
 from oat_gym.domains.task import Task
 from oat_gym.domains.truth import Truth
@@ -45,7 +46,10 @@ def load(name: str) -> minari.MinariDataset:
         DatasetNotFoundError: if the data is not on this machine; the message says how to get it.
     """
     if name not in DATASETS:
-        raise ConfigurationError(f"There is no dataset named {name!r}; the names are {', '.join(sorted(DATASETS))}.")
+        raise ConfigurationError(
+            f"There is no dataset named {name!r}.{did_you_mean(name, DATASETS)} "
+            f"The names are {', '.join(sorted(DATASETS))}."
+        )
     return DATASETS[name]()
 
 
@@ -61,7 +65,8 @@ def task(name: str) -> Task:
         if name in candidate.datasets:
             return candidate
     raise ConfigurationError(
-        f"There is no task named {name!r}, nor one with such a dataset; the tasks are {', '.join(sorted(TASKS))}."
+        f"There is no task named {name!r}, nor one with such a dataset.{did_you_mean(name, (*TASKS, *DATASETS))} "
+        f"The tasks are {', '.join(sorted(TASKS))}."
     )
 
 

@@ -172,7 +172,7 @@ def open_source(data: DataSource) -> MinariDataset:
         data = read_d4rl(data) if is_d4rl_path(data) else find_dataset(str(data))
     if not isinstance(data, MinariDataset):
         raise ConfigurationError(
-            f"A Minari dataset, the id of one, or the path of a D4RL HDF5 file is needed, got {data!r}."
+            f"A Minari dataset, the id of one, or the path of a D4RL HDF5 file is needed, got a {type(data).__name__}."
         )
     return data
 

@@ -6,7 +6,8 @@ depends on how the episode ended. See `episodes_from_table`; `oat_gym.io.writing
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,6 +20,9 @@ from oat_gym.io.writing import episode_buffer
 Array = npt.NDArray[Any]
 Columns = str | Sequence[str]
 """One column, or several that form a vector in this order."""
+
+_NAMES_SHOWN = 30
+"""Most column names that an error lists."""
 
 
 class Table(Protocol):
@@ -54,7 +58,8 @@ def episodes_from_table(  # noqa: PLR0917  (the columns are part of the data)
         episode: column of episode ids (numbers or strings).
         order: column that orders the rows of an episode (numbers or dates).
         observations: one column, or several that form vectors; they become float64.
-        action: one column, or several that form vectors; integers stay integers.
+        action: one column, or several that form vectors; numbers stay as they are (`dataset_from_episodes` makes
+            integers of booleans and whole floats for a Discrete space).
         reward: column of rewards.
         time: column of times (numbers or dates), given back as `infos["time"]`, in seconds where it holds dates.
         propensity: column with the probability that the action taken had, in (0, 1]; gives `infos["log_prob"]`.
@@ -64,7 +69,7 @@ def episodes_from_table(  # noqa: PLR0917  (the columns are part of the data)
             default: where it holds integers. Give False where they are times, or other numbers with gaps.
 
     Raises:
-        ConfigurationError: if the table lacks a column.
+        ConfigurationError: for what is no table, a table that lacks a column, and another `terminated`.
         InvalidDataError: for unequal or empty columns, values that are no finite numbers, two rows with one order, gaps
             (see `consecutive`), probabilities outside (0, 1], and ends that leave an episode no complete step.
 
@@ -73,6 +78,7 @@ def episodes_from_table(  # noqa: PLR0917  (the columns are part of the data)
     >>> found[0].observations.ravel().tolist(), found[0].actions.tolist()
     ([0.0, 0.1, 0.2, 0.2], [1, 1, 0])
     """
+    _check_table(frame)
     ids, position = _identifiers(frame, episode), _ordinals(frame, order)
     steps = _step_columns(frame, observations, action, reward) | {"ended": _ends(frame, terminated, len(ids))}
     extras = _info_columns(frame, infos, propensity, time)
@@ -86,6 +92,28 @@ def episodes_from_table(  # noqa: PLR0917  (the columns are part of the data)
     return [_episode(ids[part[0]], _take(steps, part), _take(extras, part)) for part in parts]
 
 
+def _check_table(table: object) -> None:
+    """Raise `ConfigurationError` that names the type, and none of the values, unless an object has named columns."""
+    if _has_columns(table):
+        return
+    advice = "name its columns: pandas.DataFrame(values, columns=[...])"
+    if isinstance(table, str | os.PathLike):
+        advice = "read the file first, for example with pandas.read_csv"
+    elif isinstance(table, Iterable) and not hasattr(table, "dtype"):
+        advice = "make a frame of rows first: pandas.DataFrame(rows); lists of episodes are for dataset_from_episodes"
+    raise ConfigurationError(
+        f"The table is a {type(table).__name__}; expected a pandas or polars frame, a pyarrow table or a mapping from "
+        f"column names to arrays: {advice}."
+    )
+
+
+def _has_columns(table: Any) -> bool:
+    if any(hasattr(table, name) for name in ("column_names", "columns")):
+        return True
+    dtype = getattr(table, "dtype", None)  # of a structured array, or of a pandas Series, which is one column
+    return hasattr(table, "keys") if dtype is None else getattr(dtype, "names", None) is not None
+
+
 def _step_columns(table: Table, observations: Columns, action: Columns, reward: str) -> dict[str, Array]:
     return {
         "observations": _matrix(table, observations).astype(np.float64),
@@ -97,6 +125,11 @@ def _step_columns(table: Table, observations: Columns, action: Columns, reward: 
 def _ends(table: Table, terminated: bool | str, rows: int) -> npt.NDArray[np.bool_]:
     if isinstance(terminated, str):
         return _numbers(table, terminated).astype(bool)
+    if not isinstance(terminated, bool | np.bool_):
+        raise ConfigurationError(
+            f"terminated must be True, False or the name of a column, got a {type(terminated).__name__}: give False "
+            "where the log stops before the episodes end, and a column where only some of them terminated."
+        )
     return np.full(rows, terminated)
 
 
@@ -128,7 +161,8 @@ def _check_times(times: Array, ids: Array, parts: Sequence[Array], *, name: str)
 def _column(table: Table, name: str) -> Array:
     names = _column_names(table)
     if name not in names:
-        raise ConfigurationError(f"The table has no column {name!r}; its columns are {names}.")
+        more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
+        raise ConfigurationError(f"The table has no column {name!r}; its columns are {names[:_NAMES_SHOWN]}{more}.")
     values = table[name]
     if getattr(getattr(values, "dtype", None), "tz", None) is not None:  # pandas would give objects; in UTC
         array = values.to_numpy(dtype="datetime64[ns]")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 import shutil
@@ -21,11 +22,16 @@ from minari.dataset.episode_data import EpisodeData
 from minari.dataset.minari_dataset import parse_dataset_id
 from minari.dataset.minari_storage import MinariStorage
 
+from oat_gym._ids import describe_ids
 from oat_gym.episodes import check_episode
-from oat_gym.errors import ConfigurationError, DatasetExistsError, InvalidDataError
-from oat_gym.spaces import Batch, get_leaf, iter_leaf_spaces
+from oat_gym.errors import ConfigurationError, DatasetExistsError, InvalidDataError, SaveError
+from oat_gym.export import is_disk_error
+from oat_gym.spaces import Batch
 
 logger = logging.getLogger(__name__)
+
+_MOST_EXACT = 2**53
+"""The largest number below which every float of 64 bits that is whole is one integer."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,7 @@ class DatasetCard:
             parse_dataset_id(self.dataset_id)
         except (TypeError, ValueError) as error:  # TypeError: Minari's answer to an id without a version
             raise ConfigurationError(
-                f"dataset_id={self.dataset_id!r} is not a Minari id; write it as 'namespace/name-v0'."
+                f"dataset_id={self.dataset_id!r} is not a Minari id; write it as {describe_ids(self.dataset_id)}."
             ) from error
 
     def metadata(self) -> dict[str, Any]:
@@ -116,32 +122,50 @@ def dataset_from_episodes(
     """Write episodes as a Minari dataset in `directory` (data in `directory/data`) and return it opened.
 
     The folder appears complete or not at all: it is written under a temporary name beside its place and renamed.
-    Minari's own root is not touched; to list the dataset there, choose `directory` inside it. The format is HDF5.
+    Minari's own root is not touched; `minari.storage.get_dataset_path(card.dataset_id)` is the directory with which
+    Minari knows the dataset by its id. The format is HDF5.
+
+    Where a space is Discrete or MultiDiscrete, booleans and whole numbers stored as floats, as tables often have them,
+    become integers.
 
     Raises:
         DatasetExistsError: if `directory` exists.
+        SaveError: if the disk refuses; nothing is left behind.
+        ConfigurationError: if an episode is no `EpisodeBuffer`.
         InvalidDataError: without episodes, and for episodes that break the T+1 rule or leave the spaces.
     """
-    target = Path(directory)
-    if target.exists():
+    target = Path(directory).resolve()  # Minari cannot measure a folder by a relative path
+    if os.path.lexists(target):
         raise DatasetExistsError(f"{target} is already there and was left as it is; choose another directory.")
-    buffers = list(episodes)
+    buffers = [_checked(*numbered, observation_space, action_space) for numbered in enumerate(episodes)]
     if not buffers:
         raise InvalidDataError("No episodes were given, and a Minari dataset has at least one.")
-    for number, buffer in enumerate(buffers):
-        _check_buffer(number, buffer, observation_space, action_space)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as error:
+        raise _save_error(target, error) from error
     try:
         storage = MinariStorage.new(temporary / "data", observation_space, action_space, card.env_spec)
         storage.update_metadata(card.metadata())
         storage.update_episodes(buffers)
         temporary.chmod(0o755)  # mkdtemp keeps others out, which a dataset folder should not
         _publish(temporary, target)
+    except (OSError, RuntimeError, ValueError) as error:  # HDF5 tells a full disk by any of them
+        if is_disk_error(error):
+            raise _save_error(target, error) from error
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     logger.info("wrote %d episodes to %s", len(buffers), target)
     return minari.MinariDataset(target / "data")
+
+
+def _save_error(target: Path, error: Exception) -> SaveError:
+    return SaveError(
+        f"The dataset could not be written to {target} ({error}); nothing of it was left there. Free some space, or "
+        "give a directory that can be written."
+    )
 
 
 def _publish(temporary: Path, target: Path) -> None:
@@ -153,9 +177,15 @@ def _publish(temporary: Path, target: Path) -> None:
         raise DatasetExistsError(f"{target} appeared while this dataset was written, and was left as it is.") from error
 
 
-def _check_buffer(
+def _checked(
     number: int, buffer: EpisodeBuffer, observation_space: gym.Space[Any], action_space: gym.Space[Any]
-) -> None:
+) -> EpisodeBuffer:
+    """Return an episode that keeps the T+1 rule and is inside the spaces, in integers where these hold integers."""
+    if not isinstance(buffer, EpisodeBuffer):
+        raise ConfigurationError(
+            f"Episode {number} is a {type(buffer).__name__}; expected an EpisodeBuffer: episode_buffer makes one of "
+            "arrays, and oat_gym.io.tables.episodes_from_table a list of them of a table."
+        )
     episode = EpisodeData(
         id=number,
         observations=buffer.observations,
@@ -166,18 +196,45 @@ def _check_buffer(
         infos=buffer.infos or {},
     )
     check_episode(episode, observation_space, action_space)
-    _check_values(f"The observations of episode {number}", episode.observations, observation_space)
-    _check_values(f"The actions of episode {number}", episode.actions, action_space)
+    return dataclasses.replace(
+        buffer,
+        observations=_inside(f"The observations of episode {number}", episode.observations, observation_space),
+        actions=_inside(f"The actions of episode {number}", episode.actions, action_space),
+    )
 
 
-def _check_values(what: str, batch: Batch, space: gym.Space[Any]) -> None:
-    for path, leaf in iter_leaf_spaces(space):
-        if not _inside(get_leaf(batch, path), leaf):
-            where = "".join(f"[{key!r}]" for key in path)
-            raise InvalidDataError(f"{what}{where} are not all in {leaf}; correct the values or widen the space.")
+def _inside(what: str, batch: Batch, space: gym.Space[Any]) -> Batch:
+    """Return a batch all of whose values are in the space; raise `InvalidDataError` that names what is not."""
+    if isinstance(space, spaces.Dict):
+        return batch | {key: _inside(f"{what}[{key!r}]", batch[key], part) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(_inside(f"{what}[{key}]", batch[key], part) for key, part in enumerate(space.spaces))
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        batch = _integers(what, batch, space)
+    if not _contains(batch, space):
+        raise InvalidDataError(f"{what} are not all in {space}; correct the values or widen the space.")
+    return batch
 
 
-def _inside(values: Sequence[Any], leaf: gym.Space[Any]) -> bool:
+def _integers(what: str, values: Batch, space: gym.Space[Any]) -> Batch:
+    """Return the values of a space of integers as integers; those that are stored as such stay as they are."""
+    array = np.asarray(values)
+    if array.dtype.kind in "iu":
+        return values
+    if array.dtype.kind == "b":
+        return array.astype(space.dtype)
+    bad = np.ones(array.shape, dtype=bool)
+    if array.dtype.kind == "f":
+        bad = ~(np.isfinite(array) & (array == np.floor(array)) & (np.abs(array) <= _MOST_EXACT))
+    if bad.any():
+        raise InvalidDataError(
+            f"{what} are of dtype {array.dtype}, the first that is no integer {array[bad][0]!s:.40}, and {space} holds "
+            "integers: convert them, or declare another space."
+        )
+    return array.astype(space.dtype)
+
+
+def _contains(values: Sequence[Any], leaf: gym.Space[Any]) -> bool:
     if not isinstance(leaf, spaces.Box):
         return all(leaf.contains(value) for value in values)
     array = np.asarray(values)

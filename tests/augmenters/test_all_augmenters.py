@@ -89,7 +89,9 @@ def test_it_is_composed_and_mixed(method: Augmenter, walk_dataset: minari.Minari
         recipe = data.save(f"test/{made.name}-v0", lazy=True)
         assert content_hash(recipe) == content_hash(data)
         assert [len(episode.rewards) for episode in data] == list(data.storage.lengths(range(len(data))))
-    with pytest.raises(ConfigurationError, match="A recipe names methods of"):
+    with pytest.raises(
+        ConfigurationError, match=r"methods of oat_gym.AUGMENTERS \(oat, [^)]*, dgw\), alone or in Compose"
+    ):
         data = AugmentedDataset(walk_dataset, Compose((method, Function(soften))), factor=2)
         data.save("test/function-v0", lazy=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import minari
@@ -11,7 +12,7 @@ from gymnasium import spaces
 
 from oat_gym import OAT, TDA, AugmentedDataset, MiningConfig
 from oat_gym.augmenters.stitched import StitchingAugmenter
-from oat_gym.errors import AugmentationWarning, InvalidDataError
+from oat_gym.errors import AugmentationWarning, ShortEpisodesError
 from tests.conftest import install_dataset, walks
 
 BOX = spaces.Box(-100, 100, (2,)), spaces.Box(-1, 1, (2,))
@@ -104,8 +105,12 @@ def test_episodes_without_room_before_their_ends_are_named(form: StitchingAugmen
         buffers.append(replace(buffer, terminations=died, truncations=np.zeros(6, dtype=bool)))
     real = install_dataset("test/no-room-v0", buffers, *BOX)
     data = AugmentedDataset(real, form, factor=2)
-    with pytest.raises(InvalidDataError, match=r"No episode has the 6 steps .* 5 to 5\. .*ends='generated'"):
+    with pytest.raises(
+        ShortEpisodesError, match=r"No episode has the 6 steps .* 5 to 5\. .*ends='generated'"
+    ) as caught:
         data.fit()
+    assert caught.value.length == 2
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # a worker process hands it on
 
 
 def test_recorded_rewards_are_values_of_the_data(forms: list[StitchingAugmenter]) -> None:

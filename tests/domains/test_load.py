@@ -15,6 +15,8 @@ from oat_gym.errors import DatasetNotFoundError, OatGymError
 def test_an_unknown_name_is_refused_with_the_names():
     with pytest.raises(OatGymError, match=r"no dataset named 'maze'.*adroit-door-human, .*maze2d-umaze, .*tutor-sim"):
         domains.load("maze")
+    with pytest.raises(OatGymError, match="Did you mean 'maze2d-umaze'"):
+        domains.load("maze2d-umze")
     for function in (domains.policies, domains.truth, domains.initial_states, domains.task):
         with pytest.raises(OatGymError, match=r"no task named 'maze'.*adroit-door, .*maze2d-umaze, .*tutor-sim"):
             function("maze")

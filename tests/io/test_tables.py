@@ -1,6 +1,7 @@
 """Tables to episodes: values encode (episode, row), lengths differ, and rows come in any order."""
 
 import doctest
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -88,6 +89,35 @@ def test_cut_off_episodes_end_in_the_last_recorded_observation(shuffle):
         assert episode.infos["t"].tolist() == list(range(10, 10 + steps))
         assert episode.truncations.tolist() == [False] * (steps - 1) + [True]
         assert not episode.terminations.any()
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ([{"id": 1, "name": "J. Doe"}] * 500, r"^The table is a list; .*pandas.DataFrame\(rows\)"),
+        ("log.csv", r"^The table is a str; .*pandas.read_csv"),
+        (Path("log.csv"), r"^The table is a \w*Path; .*pandas.read_csv"),
+        (np.zeros((500, 6)), "^The table is a ndarray; .*name its columns"),
+        (pd.Series(["J. Doe"] * 500), "^The table is a Series; .*name its columns"),
+        (None, "^The table is a NoneType; "),
+    ],
+)
+def test_what_is_no_table_is_named_by_its_type_alone(table, message):
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        episodes_from_table(table, **ROLES)
+    assert len(str(caught.value)) < 300
+    assert "Doe" not in str(caught.value)
+
+
+def test_of_many_columns_some_are_named():
+    with pytest.raises(ConfigurationError, match=r"'c29'\] and 70 more\.$"):
+        episodes_from_table({f"c{i}": [0] for i in range(100)}, **ROLES)
+
+
+@pytest.mark.parametrize("terminated", [None, 1, pd.Series(["J. Doe"])])
+def test_how_episodes_ended_is_told_or_asked_for(terminated):
+    with pytest.raises(ConfigurationError, match="terminated must be True, False or the name of a column, got a"):
+        episodes_from_table(make_table(), **ROLES, terminated=terminated)
 
 
 def test_a_column_can_say_which_episodes_terminated():
