@@ -69,6 +69,9 @@ def test_augmented_episodes_are_paired_and_the_truth_is_compared(
         )
     for words in ("real", "augmented", "Change by the synthetic episodes", "mae", "regret at 1"):
         assert words in printed
+    _, changes = printed.split("Change by the synthetic episodes:")
+    assert changes.count("  False") == 2  # the behaviour policy is a clone
+    assert "covers training False: Resamples do not reach what was fitted" in changes
 
 
 def test_a_dataset_of_no_task_needs_policies(walk_dataset: minari.MinariDataset) -> None:

@@ -20,6 +20,7 @@ from oat_gym.cli._output import prepare_file
 from oat_gym.cli._shared import Dataset, Factor, Seed, check_choice, find_augmenter, length_advice, open_source, out
 from oat_gym.dataset import AugmentedDataset
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError
+from oat_gym.ope.result import PARTIAL
 from oat_gym.progress import progress_bar
 from oat_gym.spaces import Batch
 
@@ -106,13 +107,14 @@ def _tell(
 
 
 def _print_estimates(result: ope.Result) -> None:
-    _print_rows(
-        result.over_seeds(),
-        ("policy", "estimator", "data", "value", "standard_error", "low", "high", "covers_training"),
-    )
+    interval = ("standard_error", "low", "high", "covers_training")
+    averages = result.over_seeds()
+    _print_rows(averages, ("policy", "estimator", "data", "value", *interval))
     if result.question.paired:
         out.print("Change by the synthetic episodes:")
-        _print_rows(result.differences, ("policy", "estimator", "seed", "difference", "standard_error", "low", "high"))
+        _print_rows(result.differences, ("policy", "estimator", "seed", "difference", *interval))
+    if not all(row["covers_training"] for row in averages):
+        out.print("covers training False: " + " ".join(PARTIAL))
 
 
 def _print_errors(result: ope.Result, known: dict[str, float] | domains.Truth) -> None:

@@ -27,6 +27,7 @@ from oat_gym._rng import derive, torch_generator
 from oat_gym.cache import read_sealed, write_sealed
 from oat_gym.episodes import collect_transitions
 from oat_gym.errors import CacheError, ConfigurationError, DatasetNotFoundError, InvalidDataError, TrainingError
+from oat_gym.ope._deviation import deviation
 from oat_gym.ope.policies import CategoricalPolicy, EpsilonGreedyPolicy, check_discrete
 from oat_gym.spaces import Batch, FlatSpace
 
@@ -197,7 +198,7 @@ def _prepare(
     states, following = space.flatten(table.observations), space.flatten(table.next_observations)
     mean, scale = states.mean(axis=0), states.std(axis=0)
     scale[scale < 1e-6] = 1.0
-    unit = float(table.rewards.std() or 1.0) if reward_scale is None else reward_scale
+    unit = float(deviation(table.rewards) or 1.0) if reward_scale is None else reward_scale
     first = int(dataset.action_space.start)  # pyright: ignore[reportAttributeAccessIssue]
     data = _Data(
         states=torch.as_tensor(((states - mean) / scale).astype(np.float32)),

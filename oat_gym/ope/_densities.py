@@ -24,7 +24,10 @@ Density = Literal["gaussian", "censored", "tanh-gaussian", "mixture", "categoric
 _CONSTANT = 1e-6  # a column whose spread is below this share of its size is constant up to float32 rounding
 
 INSIDE = 1e-4
-"""How far inside the bounds a tanh-Gaussian reads actions (as DOPE does), in halves of the range."""
+"""How far inside the bounds tanh-Gaussians read actions (as DOPE does), in halves of the range.
+
+Targets and clones share it, since their densities at saturated actions are divided by each other.
+"""
 LOG_STD = (-5.0, 2.0)
 """Range of a tanh-Gaussian's log standard deviation (DOPE's)."""
 

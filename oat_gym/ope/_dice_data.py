@@ -14,6 +14,7 @@ from torch import Tensor
 from oat_gym._rng import derive
 from oat_gym.episodes import BoolArray, IntArray
 from oat_gym.errors import InvalidDataError
+from oat_gym.ope._deviation import deviation
 from oat_gym.ope._fqe_batch import Encoder
 from oat_gym.ope._q_data import QData
 from oat_gym.ope._q_function import Choices, action_choices
@@ -104,8 +105,8 @@ class DiceBatches:
         self._next = Side.of(encoder, data.next_states, remaining - 1, following, device)
         self._first = Side.of(encoder, problem.initial_states, start, initial, device)
         # The restarted process never ends, so that a constant added to all rewards changes no ratio.
-        spread = float(data.rewards.std()) or 1.0
-        self._rewards = tensor((data.rewards - data.rewards.mean()) / spread, device)
+        unit = float(deviation(data.rewards)) or 1.0
+        self._rewards = tensor((data.rewards - data.rewards.mean()) / unit, device)
         self._done = tensor(ends(problem, keep).astype(np.float64), device)
         self._queue: list[tuple[Tensor, ...]] = []
 

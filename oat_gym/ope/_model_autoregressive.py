@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from oat_gym.ope._fqe_network import Architecture, Layers, forward
-from oat_gym.ope._model_data import Moves, Ranges, Split, tensor
+from oat_gym.ope._model_data import MIN_VARIANCE, Moves, Ranges, Split, tensor
 from oat_gym.ope._model_ensemble import one_hot_draw
 from oat_gym.ope._model_training import Fitted, Fitting, fit, member_layers
 
@@ -68,7 +68,7 @@ class FactorTask:
         self._absent = torch.arange(self._heads, device=device) >= sizes.clamp(min=1)[:, None]
         gaussian = np.array([f.categories == 0 for f in factors])
         spread = np.where(gaussian, np.stack(targets).var(axis=1), 1.0)
-        self._spread = tensor(np.where(spread > 0, spread, 1.0), device)
+        self._spread = tensor(np.where(spread > MIN_VARIANCE, spread, 1.0), device)
         self.architecture = Architecture(self._x.shape[1], hidden, self._heads)
 
     def inputs(self, rows: Tensor) -> Tensor:
@@ -102,7 +102,7 @@ class FactorTask:
         return torch.where(self._categorical.squeeze(-1), categorical, gaussian).view(heads.shape[:2])
 
     def squared_error(self, heads: Tensor, rows: Tensor) -> Tensor:
-        """Return the squared error of each factor's mean over its variance (of categories: half of Brier's score)."""
+        """Return the squared error of each factor's mean over its variance (constants: 1; categories: half Brier's)."""
         raw, target = self._split(heads, rows)
         gaussian = (raw[..., 0] - target).square() / self._spread[:, None]
         brier = 0.5 * self._residual(raw, target).square().sum(dim=-1)

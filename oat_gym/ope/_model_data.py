@@ -18,6 +18,8 @@ from oat_gym.ope.problem import Problem
 from oat_gym.spaces import Layout
 
 FloatArray = npt.NDArray[np.float64]
+MIN_VARIANCE = 1e-8
+"""z-scored columns of less variance are constant up to rounding: their errors are not counted in parts of it."""
 
 
 @dataclass(frozen=True)

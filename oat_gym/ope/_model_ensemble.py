@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from oat_gym.ope._fqe_network import Architecture, Layers, forward
-from oat_gym.ope._model_data import Moves, Ranges, Split, tensor
+from oat_gym.ope._model_data import MIN_VARIANCE, Moves, Ranges, Split, tensor
 from oat_gym.ope._model_training import Fitted, Fitting, fit, member_layers
 
 FloatArray = npt.NDArray[np.float64]
@@ -39,9 +39,8 @@ class MeanTask:
         self._inputs, self._targets = tensor(inputs, device), tensor(targets, device)
         self._blocks, self._probability = blocks, probability
         spread = targets.var(axis=0)
-        self._weight = tensor(
-            (spread > 0) / np.where(spread > 0, spread, 1.0) / max(int((spread > 0).sum()), 1), device
-        )
+        varies = spread > MIN_VARIANCE
+        self._weight = tensor(varies / np.where(varies, spread, 1.0) / max(int(varies.sum()), 1), device)
         self.architecture = Architecture(inputs.shape[1], hidden, targets.shape[1])
 
     def inputs(self, rows: Tensor) -> Tensor:
@@ -53,11 +52,11 @@ class MeanTask:
         return means(heads, self._blocks, probability=self._probability) - self._targets[rows]
 
     def loss(self, heads: Tensor, rows: Tensor) -> Tensor:
-        """Return the mean over columns of the squared error over the variance (of one-hot columns: Brier's score)."""
+        """Return the mean over varying columns of the squared error over the variance (of one-hot ones: Brier's)."""
         return self.squared_error(heads, rows)
 
     def squared_error(self, heads: Tensor, rows: Tensor) -> Tensor:
-        """Return the mean over columns of the squared error over the variance."""
+        """Return the mean over the columns that vary of the squared error over the variance."""
         return self.slope(heads, rows).square() @ self._weight
 
 

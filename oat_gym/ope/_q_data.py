@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from oat_gym.episodes import BoolArray, IntArray
+from oat_gym.ope._deviation import deviation
 from oat_gym.ope._q_function import value_scale
 from oat_gym.ope.problem import Problem
 from oat_gym.spaces import Batch, map_tree
@@ -83,7 +84,7 @@ class RewardScale:
         """Return the scaling of the training rewards; constant rewards are only centred."""
         ends = bool(data.terminated.any())
         center = 0.0 if ends else float(data.rewards.mean())
-        scale = float(data.rewards.std()) or max(abs(float(data.rewards[0])), 1.0)
+        scale = float(deviation(data.rewards)) or max(abs(float(data.rewards[0])), 1.0)
         low, high = (data.rewards.min() - center) / scale, (data.rewards.max() - center) / scale
         return cls(center, scale, min(low, 0.0) if ends else low, max(high, 0.0) if ends else high)
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from oat_gym.episodes import BoolArray, IntArray
 from oat_gym.errors import ConfigurationError
+from oat_gym.ope._deviation import deviation
 from oat_gym.ope._q_function import Choices
 
 FloatArray = npt.NDArray[np.float64]
@@ -36,7 +37,7 @@ class FeatureMap:
     ) -> FeatureMap:
         """Take the z-scores of n states (n, D) and, unless discrete, actions (n, A)."""
         x = states if discrete else np.concatenate((states, actions), axis=1)
-        center, scale = (np.zeros(x.shape[1]), np.ones(x.shape[1])) if one_hot else (x.mean(axis=0), x.std(axis=0))
+        center, scale = (np.zeros(x.shape[1]), np.ones(x.shape[1])) if one_hot else (x.mean(axis=0), deviation(x))
         return cls(center, np.where(scale > 0, scale, 1.0), degree, discrete, one_hot)
 
     def __call__(self, states: FloatArray, actions: FloatArray) -> FloatArray:

@@ -31,6 +31,10 @@ Kind = Literal["dr", "wdr", "magic"]
 class DoublyRobust(Estimator):
     """Doubly robust estimation: unbiased where either the importance weights or the action values are right.
 
+    That holds for values from the initial states of the data. Those given as `initial_states` enter by V(s_0) only,
+    while the correction stays that of the logged episodes (warned of): the value from them is right only if Q is, or if
+    its mean error is the same at both.
+
     With w_t the cumulative importance weight of step t and delta_t = r_t + gamma V(s_{t+1}) - Q(s_t, a_t), where V is
     0 in terminal states, kept at truncations, and both count the steps that remain before the horizon:
 
@@ -44,7 +48,8 @@ class DoublyRobust(Estimator):
 
     Q is fitted to the same episodes, so that its errors on them, and the correction, are smaller than on new ones.
     Replicates resample episodes with Q (and the blend) held, whatever the fit's own `bootstrap` is: the interval does
-    not cover its training. The first term is over the problem's initial states, the correction over logged episodes.
+    not cover its training (diagnostic `interval_covers_training` is 0), nor that of a `QFunction` that is given, whose
+    origin is not known here.
 
     Args:
         kind: see above.
@@ -108,6 +113,8 @@ class DoublyRobust(Estimator):
             InvalidDataError: where the behaviour policy gives a logged action the probability 0.
             ConfigurationError: where a policy's log-probability is NaN or plus infinity.
         """
+        if problem.initial_unit is None:
+            _warn_of_starts(self.name)
         if not isinstance(self.q, FQE):
             own = self.q
             return tuple(self._estimate(problem, own, None, seed) for seed in seeds)
@@ -119,18 +126,18 @@ class DoublyRobust(Estimator):
         rng = derive(seed, "doubly robust")
         errors = td_errors(problem, function, spans, draws=self.action_draws, rng=rng)
         start = _initial_values(problem, function, draws=self.action_draws, rng=rng)
+        at_start = start @ problem.initial_weights().T
         results = [
-            self._correction(problem, spans, weights, p, errors=errors[p], start=start[p]) for p in range(len(start))
+            self._correction(problem, spans, weights, p, errors=errors[p], start=start[p], at_start=at_start[p])
+            for p in range(len(start))
         ]
         diagnostics = weight_diagnostics(problem, spans, weights)
         _warn_of_size(problem, self.name, diagnostics)
         corrections = np.array([value for value, _, _ in results])
-        replicates = start @ problem.initial_weights().T + np.stack([parts for _, parts, _ in results])
-        fitted: Sequence[Diagnostics] = ({},) * len(start)
-        if fit is not None:
-            fitted = [{**own, "interval_covers_training": 0.0} for own in fit.diagnostics]
+        replicates = at_start + np.stack([parts for _, parts, _ in results])
+        fitted: Sequence[Diagnostics] = ({},) * len(start) if fit is None else fit.diagnostics
         merged = [
-            {**own, **of_weights, "correction": value, **more}
+            {**own, "interval_covers_training": 0.0, **of_weights, "correction": value, **more}
             for own, of_weights, (value, _, more) in zip(fitted, diagnostics, results, strict=True)
         ]
         return Estimates(start.mean(axis=1) + corrections, replicates, tuple(merged))
@@ -144,8 +151,12 @@ class DoublyRobust(Estimator):
         *,
         errors: FloatArray,
         start: FloatArray,
+        at_start: FloatArray,
     ) -> tuple[float, FloatArray, Diagnostics]:
-        """Return the correction of one policy, on each resample, and diagnostics."""
+        """Return the correction of one policy, on each resample, and diagnostics.
+
+        `start` (M,) are V(s_0), `at_start` (B,) their means on the resamples.
+        """
         counts, logs = spans.counts(problem.resamples), weights.log_cumulative[p]
         if self.kind == "dr":
             terms = weighted_terms(errors, logs, spans, problem.gamma)
@@ -154,7 +165,7 @@ class DoublyRobust(Estimator):
         value, replicates = normalised_sums(logs, errors, final, spans, gamma=problem.gamma, counts=counts)
         if self.kind == "wdr":
             return value, replicates, {}
-        interval = bias_interval(start.mean() + value, start.mean() + replicates)
+        interval = bias_interval(start.mean() + value, at_start + replicates)
         weighted = normalised_errors(errors, (logs, final), spans)
         weighted *= discounts(problem.gamma, weighted.shape[1])
         first = _by_episode(problem, start, spans)
@@ -238,6 +249,17 @@ def _full(horizon: int | None, n: int) -> IntArray | None:
 
 def _rows(batch: Batch, rows: IntArray) -> Batch:
     return map_tree(lambda leaf: leaf[rows], batch)
+
+
+def _warn_of_starts(name: str) -> None:
+    """Say that the two terms are of different initial states, where the user gave some."""
+    warnings.warn(
+        f"{name}: the correction weights logged episodes, so that it is that of the initial states of the data and not "
+        "of those given as initial_states. From these the values are right only if the action values are, or if their "
+        "mean error is the same at both: importance weights do not make up for it.",
+        EstimationWarning,
+        stacklevel=4,
+    )
 
 
 def _warn_of_size(problem: Problem, name: str, diagnostics: tuple[Diagnostics, ...]) -> None:

@@ -15,6 +15,7 @@ from minari import MinariDataset
 
 from oat_gym.dataset import find_source
 from oat_gym.errors import ConfigurationError, ConformanceError, EstimationWarning
+from oat_gym.ope._policy_checks import check_policies
 from oat_gym.ope._setup import (
     Behavior,
     BehaviorSource,
@@ -85,12 +86,15 @@ def evaluate(
     Returns:
         The table, `Result.rows`: policy, estimator, seed, value, standard_error, low, high, diagnostics. The intervals
         of estimators that train hold fixed what was trained, unless they are told otherwise
-        (`FQE(ensemble=10, bootstrap=True)`, `ModelBased(bootstrap=True)`): the diagnostic `interval_covers_training` is
-        then 0, and `Result.table` marks them with a star.
+        (`FQE(ensemble=10, bootstrap=True)`, `ModelBased(bootstrap=True)`); those of importance weights hold a cloned
+        behaviour policy fixed, always. The diagnostic `interval_covers_training` is then 0, and `Result.table` marks
+        them with a star.
 
     Raises:
-        ConfigurationError: for settings that cannot work; before any work.
-        InvalidDataError: for data that is not finite, or has no real episode.
+        ConfigurationError: for settings that cannot work, and policies over another action space than the data's;
+            before any work.
+        InvalidDataError: for data that is not finite, or has no real episode, and for policies that return actions of
+            another form, or NaN.
 
     Warns:
         EstimationWarning: where a value is not to be trusted; the rows' diagnostics hold its text too.
@@ -125,6 +129,7 @@ def evaluate(
         resamples=draw_resamples(logged.n_units, resamples),
         device=device,
     )
+    check_policies(target, logged)
     with _reporter(progress) as report:
         factory = _Factory(replace(base, progress=report), behavior)
         return _run_all(factory, list(zip(chosen, used, strict=True)), numbers, question)
@@ -201,6 +206,7 @@ def _rows(run: _Run, seeds: tuple[int, ...], question: Question) -> tuple[list[R
         extra: dict[str, Any] = {"warnings": texts}
         if isinstance(source, BehaviorSource) and seed in source.asked and seed in source.held_out:
             extra["behavior_held_out_log_likelihood"] = source.held_out[seed]
+            extra["interval_covers_training"] = 0.0  # resamples hold the clone fixed
         for p, policy in enumerate(run.problem.policies.names):
             value, replicates = float(estimates.values[p]), estimates.replicates[p]
             error, low, high = spread(value, replicates, question)

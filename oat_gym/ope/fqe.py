@@ -59,8 +59,8 @@ class FQE(Estimator):
     Diagnostics: `interval_covers_training`; of networks `td_error` (root mean square, last tenth of the updates,
     environment units), `share_clipped` (of targets, last tenth), `late_change` (of the value, last tenth of the
     updates), `ensemble_sd`; of tables `unsupported_mass`, the discounted probability of coming to a pair that the
-    data does not hold. An `EstimationWarning` names the policies whose value has not settled, sits at the bounds, or
-    is unsupported.
+    data does not hold. An `EstimationWarning` names the policies whose value has not settled, sits at the bounds or
+    outside them, or is unsupported.
 
     Args:
         approximation: see above.
@@ -228,6 +228,8 @@ def _reasons(
         ahead = max(1.0, 10 * value_scale(problem) / (fqe.tau * fqe.updates))
         if abs(numbers["late_change"]) * ahead > MAX_LATE_CHANGE * max(abs(value), (high - low) / 20) > 0:
             found.append("has not settled (late_change): give more updates, or a larger tau")
-    if high > low and (numbers.get("share_clipped", 0.0) > MAX_CLIPPED or not low <= value <= high):
+    if high > low and not low <= value <= high:
+        found.append(f"lies outside what the data's rewards allow, {low:.6g} to {high:.6g}")
+    elif high > low and numbers.get("share_clipped", 0.0) > MAX_CLIPPED:
         found.append(f"is at the bounds that the data's rewards allow, {low:.6g} to {high:.6g}")
     return found

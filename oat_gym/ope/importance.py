@@ -39,6 +39,9 @@ class ImportanceSampling(Estimator):
     truncation are unknown and missing: the share of discounted steps hidden that way is reported and warned of. The
     initial states are those of the logged episodes, whatever `initial_states` says (warned of).
 
+    Intervals are of the weights as they are: with a cloned behaviour policy resamples hold the clone fixed, and
+    `evaluate` sets the diagnostic `interval_covers_training` to 0.
+
     Args:
         kind: "per-decision" or "trajectory".
         weighted: self-normalise.

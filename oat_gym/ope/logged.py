@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,10 +10,13 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 from minari import EpisodeData, MinariDataset
+from minari.dataset.minari_dataset import parse_dataset_id
+from minari.dataset.minari_storage import MinariStorage
+from minari.storage import get_dataset_path
 
 from oat_gym.dataset import AugmentedDataset
 from oat_gym.episodes import BoolArray, IntArray, Transitions, check_episode, collect_transitions
-from oat_gym.errors import InvalidDataError
+from oat_gym.errors import EstimationWarning, InvalidDataError
 from oat_gym.provenance import Provenance
 from oat_gym.spaces import Batch, FlatSpace, map_tree
 from oat_gym.storage import AugmentedStorage
@@ -51,7 +55,11 @@ class Logged:
         Raises:
             InvalidDataError: for a dataset without real episodes, or with values that are not finite.
             UnsupportedSpaceError: for spaces that have no feature matrix.
+
+        Warns:
+            EstimationWarning: for a dataset that Minari combined from augmented ones, which loses the provenance.
         """
+        _warn_if_combined(dataset)
         metadata = dataset.storage.get_episode_metadata(dataset.episode_indices)
         origins = [
             Provenance.from_metadata(part, int(number))
@@ -122,6 +130,29 @@ class Logged:
         """Return the first observations of the chosen episodes, as a batch of the space."""
         first = self.offsets[:-1][episodes]
         return map_tree(lambda leaf: leaf[first], self.steps.observations)
+
+
+def _warn_if_combined(dataset: MinariDataset) -> None:
+    """Warn where a dataset was combined from augmented ones: `combine_datasets` drops what their episodes say.
+
+    Only saved parts that are still on this machine are known to be augmented.
+    """
+    augmented: list[str] = []
+    for name in dataset.storage.metadata.get("combined_datasets", ()):
+        try:
+            parse_dataset_id(name)  # also keeps "../" out
+            metadata = MinariStorage.read_raw_metadata(get_dataset_path(name) / "data")
+        except (OSError, TypeError, ValueError):
+            continue
+        augmented += [name] if "oat_gym" in metadata or metadata.get("data_format") == AugmentedStorage.FORMAT else []
+    if augmented:
+        warnings.warn(
+            f"{dataset.id!r} was combined from augmented datasets ({', '.join(dict.fromkeys(augmented))}). Minari "
+            "drops the provenance of their episodes, so that synthetic ones count as real and intervals are too "
+            "narrow: combine the real data first, then augment.",
+            EstimationWarning,
+            stacklevel=3,
+        )
 
 
 def _steps(dataset: MinariDataset, origins: list[Provenance]) -> Transitions:

@@ -169,8 +169,14 @@ def t_test(
 
 def _vector(values: npt.ArrayLike, name: str) -> FloatArray:
     array = np.asarray(values, dtype=np.float64)
-    if array.ndim != 1 or len(array) < 2 or not np.isfinite(array).all():
-        raise InvalidDataError(f"{name} must be a row of at least two finite numbers, got shape {array.shape}.")
+    if array.ndim != 1 or len(array) < 2:
+        raise InvalidDataError(f"{name} must be a row of at least two numbers, got shape {array.shape}.")
+    bad = int((~np.isfinite(array)).sum())
+    if bad:
+        raise InvalidDataError(
+            f"{name} must be finite numbers, and {bad} of {len(array)} are NaN or infinite: on those resamples the "
+            "estimator gave no value."
+        )
     return array
 
 

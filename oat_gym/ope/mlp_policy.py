@@ -15,6 +15,7 @@ from gymnasium import spaces
 
 from oat_gym.errors import ConfigurationError, InvalidDataError
 from oat_gym.generation._layers import one_thread
+from oat_gym.ope._densities import INSIDE
 from oat_gym.ope.gaussian import ActionBox, gaussian_log_density
 from oat_gym.ope.policy import FloatArray
 from oat_gym.spaces import Batch
@@ -23,7 +24,6 @@ Affine = tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]
 """A layer x -> W x + b: W (outputs, inputs) and b (outputs,)."""
 
 _CHUNK = 1 << 17  # numbers of the widest layer that are computed at a time, over all policies (1 MiB)
-_EDGE = 1e-6  # squashed actions are read as no closer to -1 and 1 than this, where their density is infinite or zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,8 @@ class MLPPolicy:
         log_std_layer: the layer of the log standard deviations.
         nonlinearity: after each hidden layer.
         action_space: actions are clipped to it and have its shape and dtype; `None`: vectors of float64, no bounds.
-        squash: actions are the tanh of the Gaussian, in (-1, 1); `log_prob` then has the Jacobian of the tanh.
+        squash: actions are the tanh of the Gaussian, in (-1, 1); `log_prob` then has the Jacobian of the tanh, and
+            reads actions closer to -1 or 1 than 1e-4 as if they were there (as the clone's tanh-Gaussian and DOPE do).
         deterministic: `sample` returns `mean`; `log_prob` stays that of the distribution.
         censored: `log_prob` is that of the clipped action, see `GaussianPolicy.censored`.
         features: observations (a batch) -> matrix (n, inputs), for observations that are no such matrix; for Dict
@@ -159,7 +160,7 @@ class MLPStack:
         result = np.empty((len(self.layers[0][0]), len(matrix)))
         for rows, mean, log_std in self._outputs(matrix):
             if self.first.squash:
-                inside = np.clip(taken[rows], -1 + _EDGE, 1 - _EDGE)
+                inside = np.clip(taken[rows], -1 + INSIDE, 1 - INSIDE)
                 density = gaussian_log_density(np.arctanh(inside), mean, np.exp(log_std)) - np.log1p(-(inside**2))
                 result[:, rows] = density.sum(axis=-1)
             else:

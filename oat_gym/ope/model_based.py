@@ -175,7 +175,8 @@ class ModelBased(Estimator):
 
         Raises:
             ConfigurationError: where the chosen kind cannot be fitted.
-            InvalidDataError: where there is nothing to learn from, or values have no solution.
+            InvalidDataError: where there is nothing to learn from, values have no solution, or a policy returns actions
+                that are not finite.
             TrainingError: where training diverges.
         """
         self.check(problem)
@@ -186,6 +187,7 @@ class ModelBased(Estimator):
             fitted = fit_tabular(problem, bootstrap=self.bootstrap)
             found = (Estimates(fitted.values, fitted.replicates, fitted.diagnostics),) * len(seeds)
         else:
+            problem.policy_actions(problem.initial, rng=derive(0, "model check"))  # raises for NaN, before training
             models = self.fit(problem, seeds=seeds)
             found = tuple(self._rolled(problem, model, seed) for model, seed in zip(models, seeds, strict=True))
         _warn(problem, found, self.name)

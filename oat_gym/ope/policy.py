@@ -122,8 +122,8 @@ class PolicySet:
     def sample(self, observations: Batch, *, rng: np.random.Generator) -> Batch:
         """Return actions drawn from each policy, leaves (P, n, ...).
 
-        Each policy has a stream of its own, seeded by one draw from `rng`: what a policy draws depends on its place in
-        the set only, not on the policies before it, nor on what is stacked.
+        Each policy has a generator of its own, all in one state, seeded by one draw from `rng` (`streams`): what a
+        policy draws depends neither on its place in the set, nor on the others, nor on what is stacked.
         """
         rngs = streams(rng, len(self))
         return self._together(lambda numbers, stack: stack.sample(observations, rngs=[rngs[p] for p in numbers]))
@@ -184,8 +184,8 @@ class _Alone:
 def streams(rng: np.random.Generator, count: int) -> list[np.random.Generator]:
     """Return the generators that the policies of a set draw from, all in one state.
 
-    What a policy draws then depends neither on its place in the set nor on the others, and the random numbers that
-    policies have in common cancel in the differences between their values.
+    The one state is on purpose: the random numbers that policies have in common cancel in the differences between
+    their values. What a policy draws depends neither on its place in the set nor on the others.
     """
     seed = int(rng.integers(0, 2**63 - 1))
     return [np.random.default_rng(seed) for _ in range(count)]

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from oat_gym.episodes import BoolArray, IntArray
+from oat_gym.ope._policy_checks import check_finite_actions
 from oat_gym.ope.logged import Logged
 from oat_gym.ope.policy import PolicySet
 from oat_gym.progress import ProgressCallback, silent
@@ -86,8 +87,16 @@ class Problem:
         return self.shared["target"]
 
     def policy_actions(self, observations: Batch, *, rng: np.random.Generator) -> FloatArray:
-        """Return features of one action of each policy, (P, n, A), drawn from it and clipped to the space."""
-        return flatten_policies(self.policies.sample(observations, rng=rng), self.data.flat_actions, len(self.policies))
+        """Return features of one action of each policy, (P, n, A), drawn from it and clipped to the space.
+
+        Raises:
+            InvalidDataError: for a policy that returns actions which are not finite.
+        """
+        drawn = self.policies.sample(observations, rng=rng)
+        actions = flatten_policies(drawn, self.data.flat_actions, len(self.policies))
+        for name, own in zip(self.policies.names, actions, strict=True):
+            check_finite_actions(name, own)
+        return actions
 
     def policy_probabilities(self, observations: Batch) -> FloatArray | None:
         """Return pi(a|s) of each action of a `Discrete` space, (P, n, K): exact expectations can be taken.

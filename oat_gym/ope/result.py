@@ -19,10 +19,12 @@ Row = dict[str, Any]
 Data = Literal["real", "augmented"]
 Key = tuple[str, str, int, Data]
 """Policy, estimator, seed, data."""
-_PARTIAL = (
-    "* Resamples do not reach what was fitted: this interval leaves out the error of training on another sample.\n"
-    "  Closed forms and ensembles have intervals with it: FQE(ensemble=10, bootstrap=True), ModelBased(bootstrap=True)."
+PARTIAL = (
+    "Resamples do not reach what was fitted: this interval leaves out the error of training on another sample.",
+    "Closed forms and ensembles have intervals with it: FQE(ensemble=10, bootstrap=True), ModelBased(bootstrap=True).",
+    "So has importance sampling with a known behaviour policy (behavior=) in place of a clone.",
 )
+"""What is said of rows whose intervals do not cover training."""
 _COLUMNS = ("policy", "estimator", "seed", "data", "value", "difference", "standard_error", "low", "high")
 
 
@@ -47,6 +49,8 @@ class Result:
         rows: a dict for each policy, estimator and seed (and "data", "real" or "augmented", of a paired evaluation):
             policy, estimator, seed, value (environment units, discounted), standard_error, low, high, diagnostics. The
             diagnostics are numbers by name, and "warnings", a tuple of the `EstimationWarning`s of that estimator.
+            `interval_covers_training` is 0 where resamples hold fixed what was fitted: action values, models, ratios,
+            or a clone of the behaviour policy that importance weights are divided by.
         draws: the bootstrap replicates (B,) of each row, by (policy, estimator, seed, data). All rows share their
             resamples, so that replicates of two rows can be subtracted.
     """
@@ -76,7 +80,9 @@ class Result:
         """What augmentation changed, of a paired evaluation: a row for each policy, estimator and seed.
 
         `difference` is the estimate with the augmented data less the one without; its standard error and interval are
-        of the differences between replicates on the same resamples.
+        of the differences between replicates on the same resamples. `covers_training` is False where the replicates of
+        either hold fixed what was fitted: the interval then leaves out that two fits differ, and chance differences
+        between fits lie outside it.
 
         Raises:
             ConfigurationError: for a result that is not paired.
@@ -84,6 +90,7 @@ class Result:
         if not self.question.paired:
             raise ConfigurationError("Only a paired evaluation has differences: ope.evaluate(..., paired=True).")
         values = {self._key(row): float(row["value"]) for row in self.rows}
+        covers = {self._key(row): _covers(row) for row in self.rows}
         rows: list[Row] = []
         for policy, estimator, seed, data in values:
             if data == "real":
@@ -92,7 +99,8 @@ class Result:
             change = values[both[0]] - values[both[1]]
             error, low, high = self._spread(change, self.draws[both[0]] - self.draws[both[1]])
             head: Row = {"policy": policy, "estimator": estimator, "seed": seed}
-            rows.append(head | {"difference": change, "standard_error": error, "low": low, "high": high})
+            tail: Row = {"low": low, "high": high, "covers_training": all(covers[key] for key in both)}
+            rows.append(head | {"difference": change, "standard_error": error} | tail)
         return rows
 
     def over_seeds(self) -> list[Row]:
@@ -151,6 +159,11 @@ class Result:
     def t_test(self, baseline: str, *, method: Literal["bootstrap", "paper"] = "bootstrap") -> list[Row]:
         """Test every policy against the policy `baseline`, for each estimator and seed (`ope.metrics.t_test`).
 
+        `covers_training` is False where the replicates of either policy hold the fit fixed. Two policies then differ by
+        chance of training too, which the standard error leaves out, and `p_value` is NaN, whatever the method: use
+        FQE(ensemble=10, bootstrap=True), a known behaviour policy, or compare the values over several seeds
+        (`over_seeds`).
+
         Raises:
             ConfigurationError: for an unknown policy.
             InvalidDataError: where replicates are not finite.
@@ -158,6 +171,7 @@ class Result:
         names = {key[0] for key in self.draws}
         if baseline not in names:
             raise ConfigurationError(f"baseline must be one of the policies {', '.join(sorted(names))}: {baseline!r}.")
+        covers = {self._key(row): _covers(row) for row in self.rows}
         rows: list[Row] = []
         for row in self.rows:
             if row["policy"] == baseline:
@@ -168,7 +182,9 @@ class Result:
                 self.draws[policy, estimator, seed, data], other, method=method, n=self.question.n_units
             )
             head = {key: row[key] for key in ("policy", "estimator", "seed", "data") if key in row}
-            rows.append(head | {"baseline": baseline} | vars(test))
+            covered = covers[self._key(row)] and covers[baseline, estimator, seed, data]
+            found = vars(test) | ({} if covered else {"p_value": math.nan})
+            rows.append(head | {"baseline": baseline} | found | {"covers_training": covered})
         return rows
 
     def table(self) -> str:
@@ -180,7 +196,7 @@ class Result:
             line[-1] += "*" * marked
         widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
         lines = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells]
-        return "\n".join(lines + [_PARTIAL] * any(partial))
+        return "\n".join([*lines, *(["* " + "\n  ".join(PARTIAL)] if any(partial) else [])])
 
     def to_frame(self) -> Any:
         """Return the rows as a `pandas.DataFrame`, a column for each diagnostic ("diagnostics.NAME").

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Normal
 
 from oat_gym.errors import ConfigurationError, InvalidDataError
+from oat_gym.ope._torch_squashed import center_of, inside_of
 from oat_gym.ope.gaussian import ActionBox
 from oat_gym.ope.policies import CategoricalPolicy, check_discrete
 from oat_gym.ope.policy import FloatArray
@@ -28,12 +29,20 @@ class TorchPolicy:
     actions, or a pair (mean, log standard deviation) of a diagonal Gaussian. It is called without gradients, in the
     mode (train or eval) that it is in, on its own device.
 
+    Squashed Gaussians (SAC's) are a `TransformedDistribution` of a tanh and, for other bounds than -1 and 1, an
+    `AffineTransform`. Torch gives it neither mean nor mode: `mean` is then the mean of what is transformed, pushed
+    through the transforms (SAC's own deterministic action; of a tanh it is the median). Its density at the bounds is
+    zero or infinite: `log_prob` reads actions closer to a tanh's -1 or 1 than 1e-4 as if they were there, as
+    `MLPPolicy` and the cloned tanh-Gaussian do.
+
     Attributes:
         module: the module (any callable of a tensor).
         action_space: Box of the actions; results are clipped to it.
         features: observations (a batch) -> array (n, ...) for the module; for Dict observations,
             `FlatSpace.of(observation_space).flatten`. `None`: the observations themselves.
         deterministic: `sample` returns `mean`; `log_prob` stays that of the distribution.
+        mean_module: gives the mean actions (n, ...) for what the module takes, where its distribution does not know
+            them (or others are wanted).
 
     >>> module = lambda states: (2 * states, torch.zeros_like(states))
     >>> policy = TorchPolicy(module, spaces.Box(-1, 1, (1,)))
@@ -45,6 +54,7 @@ class TorchPolicy:
     action_space: spaces.Box
     features: Callable[[Batch], npt.ArrayLike] | None = None
     deterministic: bool = False
+    mean_module: Callable[[Tensor], Any] | None = None
 
     def __post_init__(self) -> None:
         ActionBox(self.action_space)
@@ -59,19 +69,32 @@ class TorchPolicy:
             return self._actions(distribution.sample(), observations)
 
     def mean(self, observations: Batch) -> npt.NDArray[Any]:
-        """Return the n mean actions, clipped to the space (of a distribution without a mean: its mode)."""
+        """Return the n mean actions, clipped to the space (of a distribution without a mean: its mode).
+
+        Raises:
+            ConfigurationError: for a distribution with neither that is no transformed one; give `mean_module`.
+        """
+        if self.mean_module is not None:
+            center = call_module(self.mean_module, observations, self.features)
+            if not isinstance(center, Tensor):
+                raise InvalidDataError(f"TorchPolicy: mean_module must return a tensor, got {type(center).__name__}.")
+            return self._actions(center, observations)
         distribution = self._distribution(observations)
-        try:
-            center = distribution.mean
-        except NotImplementedError:
-            center = distribution.mode
+        center = center_of(distribution)
+        if center is None:
+            raise ConfigurationError(
+                f"TorchPolicy: {type(distribution).__name__} has neither mean nor mode, which estimators of "
+                "deterministic actions need: give mean_module=, a function of the same tensor that returns the mean "
+                "actions (n, ...)."
+            )
         return self._actions(center, observations)
 
     def log_prob(self, observations: Batch, actions: Batch) -> FloatArray:
         """Return log pi(a|s), (n,)."""
         taken = torch.as_tensor(np.array(actions, dtype=np.float32), device=module_device(self.module))
         with torch.no_grad():
-            values = self._distribution(observations).log_prob(taken)
+            distribution = self._distribution(observations)
+            values = distribution.log_prob(inside_of(distribution, taken))
         return values.reshape(len(taken), -1).sum(dim=1).cpu().numpy().astype(np.float64)
 
     def _distribution(self, observations: Batch) -> Distribution:

@@ -13,7 +13,7 @@ GAMMA = 0.9
 BOX = spaces.Box(-100.0, 100.0, (2,), np.float64)
 
 
-def line_dataset(folder, *, episodes=200, first_action=0, seed=0):
+def line_dataset(folder, *, episodes=200, first_action=0, seed=0, reward=None):
     """A corridor of 4 cells: action 0 goes left, 1 goes right; leaving at the right pays 10 and terminates."""
     rng = np.random.default_rng(seed)
 
@@ -35,7 +35,7 @@ def line_dataset(folder, *, episodes=200, first_action=0, seed=0):
         return episode_buffer(
             observations=np.stack([place, 50 + 3 * place], axis=1),
             actions=np.array(actions),
-            rewards=np.array(rewards),
+            rewards=np.array(rewards) if reward is None else np.full(steps, reward),
             terminations=ended,
             truncations=last & ~ended,
         )
@@ -96,3 +96,11 @@ def test_bad_files_and_settings_are_refused(tmp_path):
     for bad in ({"gamma": 1.0}, {"learning_rate": 0.0}, {"hidden": (0,)}, {"reward_scale": 0.0}):
         with pytest.raises(ConfigurationError):
             DQN(**bad)
+
+
+def test_constant_rewards_are_not_divided_by_their_rounding(tmp_path):
+    data = line_dataset(tmp_path / "data", episodes=50, reward=0.1)
+    config = DQN(learning_rate=3e-3, gamma=0.5, hidden=(16,), updates=300, target_every=20)
+    values = config.fit(data, seed=0).q_values(STATES)
+    assert (values > 0.05).all()
+    assert (values < 0.25).all()

@@ -301,3 +301,12 @@ def test_divergence_and_missing_solutions_raise() -> None:
     )
     with pytest.raises(InvalidDataError, match="no solution"):
         discounted_visits(loop, np.ones((1, 1)), np.ones(1), 1.0, None)
+
+
+def test_constant_rewards_are_not_divided_by_their_rounding() -> None:
+    problem = make_problem(300, features=np.random.default_rng(0).normal(size=(6, 3)))
+    steps = replace(problem.data.steps, rewards=np.full(len(problem.data.steps), 0.1))
+    assert steps.rewards.std() > 0
+    problem = replace(problem, data=replace(problem.data, steps=steps))
+    batches = DiceBatches(problem, encoder_of(problem), size=64, action_draws=1, seeds=(0,))
+    assert batches.draw().rewards.abs().max() < 1e-12

@@ -211,7 +211,7 @@ def test_magic_follows_its_definition() -> None:
         partial = parts.cumsum(axis=1)
         g, omega = partial.sum(axis=0), np.cov(partial.T) * n
         assert g[-1] == pytest.approx(full.values[p])
-        low, high = (np.quantile(full_replicates(problem, table, p, full), q) for q in (0.05, 0.95))
+        low, high = (np.quantile(full.replicates[p], q) for q in (0.05, 0.95))
         bias = np.maximum(min(low, g[-1]) - g, 0) + np.maximum(g - max(high, g[-1]), 0)
         error = omega + np.outer(bias, bias)
         found = minimize(
@@ -224,10 +224,24 @@ def test_magic_follows_its_definition() -> None:
         assert got.values[p] == pytest.approx(found.x @ g, abs=2e-3)
 
 
-def full_replicates(problem, table: FloatArray, p: int, full) -> FloatArray:
-    """Return replicates of the weighted estimate with the mean of V(s_0) held: what the bias is measured to."""
-    start = (problem.policies.policies[p].table * table[p, -1]).sum(axis=1)[problem.initial]
-    return full.replicates[p] - problem.initial_weights() @ start + start.mean()
+def test_the_bias_of_magic_is_measured_to_the_interval_of_wdr(monkeypatch: pytest.MonkeyPatch) -> None:
+    # of the whole estimate: V(s_0) is resampled with the corrections, unless its states were given
+    mdp = mdps.random_mdp(seed=3)
+    problem, policies = setting(mdp, 60)
+    q, seen = exact(mdp, policies, 0.9), list[tuple[float, FloatArray]]()
+
+    def noted(value: float, replicates: FloatArray) -> tuple[float, float]:
+        seen.append((value, replicates))
+        return bias_interval(value, replicates)
+
+    monkeypatch.setattr("oat_gym.ope.doubly_robust.bias_interval", noted)
+    for posed in (problem, replace(problem, initial=np.zeros(3, dtype=int), initial_unit=None)):
+        seen.clear()
+        with quiet():
+            full = DoublyRobust(kind="wdr", q=q).estimate(posed, seeds=(0,))[0]
+            DoublyRobust(kind="magic", q=q).estimate(posed, seeds=(0,))
+        np.testing.assert_allclose([value for value, _ in seen], full.values)
+        np.testing.assert_allclose([replicates for _, replicates in seen], full.replicates)
 
 
 def test_intervals_hold_the_action_values_fixed() -> None:
@@ -297,3 +311,22 @@ def test_settings_are_checked_and_named() -> None:
     assert (dope.kind, dope.clip, dope.q) == ("wdr", (-6.0, 2.0), FQE.preset("dope"))
     assert len({DoublyRobust(kind=kind).name for kind in KINDS}) == 3
     assert replace(dope, clip=None).name == f"DR weighted ({FQE.preset('dope').name})"
+
+
+def test_given_initial_states_are_not_doubly_robust_and_told() -> None:
+    mdp = mdps.random_mdp(seed=3)
+    problem, _ = setting(mdp, 200)
+    given = replace(problem, initial=problem.initial[:5], initial_unit=None)
+    zero = Known(np.zeros((2, mdp.n_states, mdp.n_actions)))
+    with pytest.warns(EstimationWarning, match="not of those given as initial_states") as caught:
+        from_given = DoublyRobust(kind="dr", q=zero).estimate(given, seeds=(0, 1))[0]
+    assert len(caught) == 1
+    own = DoublyRobust(kind="dr", q=zero).estimate(problem, seeds=(0,))[0]
+    np.testing.assert_allclose(from_given.values, own.values)  # a wrong Q gives the value from the data's own states
+
+
+def test_intervals_hold_given_action_values_fixed() -> None:
+    mdp = mdps.random_mdp(seed=3)
+    problem, policies = setting(mdp, 100)
+    found = DoublyRobust(q=exact(mdp, policies, 0.9)).estimate(problem, seeds=(0,))[0]
+    assert [numbers["interval_covers_training"] for numbers in found.diagnostics] == [0.0, 0.0]

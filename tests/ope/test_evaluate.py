@@ -228,6 +228,23 @@ def test_intervals_that_leave_out_training_are_marked(real: minari.MinariDataset
     assert "*" not in ask(real).table()
     covers = {row["estimator"]: row["covers_training"] for row in result.over_seeds()}
     assert covers == {IS.name: True, "FQE": False, "FQE bootstrap": True}
+    for row in result.t_test("same"):  # no p-value where chance of training is left out of it
+        assert row["covers_training"] == covers[row["estimator"]]
+        assert math.isnan(row["p_value"]) != row["covers_training"]
+    data = AugmentedDataset(real, Function(copied), count=10, seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EstimationWarning)
+        pair = ask(data, [IS, ope.FQE(), ope.FQE(bootstrap=True)], paired=True)
+    assert {row["estimator"]: row["covers_training"] for row in pair.differences} == covers
+
+
+def test_a_clone_is_held_fixed_by_resamples_and_said_to_be(real: minari.MinariDataset) -> None:
+    cloning = ope.BehaviorCloning(max_updates=20, folds=2, hidden=(8,))
+    result = ask(real, [IS, Fixed()], behavior=cloning)
+    covers = {row["estimator"]: row["diagnostics"].get("interval_covers_training") for row in result.rows}
+    assert covers == {IS.name: 0.0, "fixed": None}  # of what asks for no behaviour policy nothing is said
+    assert [line.endswith("*") for line in result.table().splitlines() if line.startswith("left")] == [True, False]
+    assert "a known behaviour policy (behavior=) in place of a clone" in result.table()
 
 
 def test_a_behaviour_policy_that_rules_out_a_logged_action_is_refused(real: minari.MinariDataset) -> None:
@@ -368,3 +385,98 @@ def test_an_estimator_of_wrong_shapes_is_named(real: minari.MinariDataset) -> No
 
     with pytest.raises(ConformanceError, match="fixed returned values, replicates and diagnostics of shapes"):
         ask(real, Wrong())
+
+
+# --- what policies do with the data's actions ------------------------------------------------------------------------
+
+
+def never(*_: object) -> float:
+    raise AssertionError("nothing is fitted for a policy that acts elsewhere")
+
+
+def function(space: spaces.Space, action: object) -> ope.FunctionPolicy:
+    return ope.FunctionPolicy(lambda state: action, action_space=space)
+
+
+BOX2 = spaces.Box(-1, 1, (2,))
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (function(BOX2, np.zeros(2)), r"'p' acts in Box.*\(2,\).*the data in Discrete\(2\)"),
+        (function(spaces.Discrete(3), 0), r"'p' acts in Discrete\(3\), the data in Discrete\(2\)"),
+        (function(spaces.Discrete(2, start=1), 1), r"'p' acts in Discrete\(2, start=1\), the data in"),
+        (function(spaces.MultiDiscrete([2]), [0]), r"'p' acts in MultiDiscrete\(\[2\]\), the data in"),
+        (ope.UniformPolicy(spaces.Discrete(3)), r"'p' acts in Discrete\(3\)"),
+    ],
+)
+def test_policies_over_other_actions_are_refused(real: minari.MinariDataset, policy: ope.Policy, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        evaluate(real, {"p": policy}, Fixed(), gamma=GAMMA, seeds=1, progress=never)
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (ope.GaussianPolicy(lambda s: np.zeros((len(s), 2)), 1.0), r"'p' returned actions of shape \(8, 2\) for 8"),
+        (ope.GaussianPolicy(lambda s: np.zeros((len(s), 1)), 1.0), "'p' returned the action .*, which is not in Disc"),
+        (ope.TabularPolicy(np.full((4, 3), 1 / 3)), r"'p' returned probabilities of shape \(8, 3\) for 8"),
+        (ope.TabularPolicy(np.full((4, 2), 0.5), first_action=4), "'p' returned the action [45], which is not in Disc"),
+    ],
+)
+def test_actions_of_policies_without_a_space_are_looked_at(
+    real: minari.MinariDataset, policy: ope.Policy, message: str
+) -> None:
+    with pytest.raises(InvalidDataError, match=message):
+        evaluate(real, {"p": policy}, Fixed(), gamma=GAMMA, seeds=1, progress=never)
+
+
+def test_continuous_policies_fit_the_data_in_shape_and_not_in_bounds(walk_dataset: minari.MinariDataset) -> None:
+    def ask_of(policy: ope.Policy) -> int:
+        return len(evaluate(walk_dataset, {"p": policy}, Fixed(value=-1.0), gamma=GAMMA, seeds=1, resamples=5).rows)
+
+    wider = spaces.Box(-9, 9, (2,), np.float64)
+    for fine in (function(wider, np.zeros(2)), ope.GaussianPolicy(lambda s: s[:, :2], 0.1)):
+        assert ask_of(fine) == 1
+    with pytest.raises(ConfigurationError, match=r"'p' acts in Box.*\(1,\).*the data in Box.*\(2,\)"):
+        ask_of(function(spaces.Box(-1, 1, (1,)), np.zeros(1)))
+    with pytest.raises(ConfigurationError, match=r"'p' acts in Discrete\(2\), the data in Box"):
+        ask_of(function(spaces.Discrete(2), 0))
+    with pytest.raises(InvalidDataError, match=r"returned actions of shape \(8, 1\) for 8.*\(8, 2\) is expected"):
+        ask_of(ope.GaussianPolicy(lambda s: s[:, :1], 0.1))
+    with pytest.raises(InvalidDataError, match="'p' returned NaN actions"):
+        ask_of(ope.GaussianPolicy(lambda s: np.full((len(s), 2), np.nan), 0.1))
+
+
+def test_nan_actions_are_no_divergence(walk_dataset: minari.MinariDataset) -> None:
+    broken = function(walk_dataset.action_space, np.full(2, np.nan))
+    for estimator in (ope.FQE(updates=10**9), ope.DICE(updates=10**9), ope.FQE(approximation="linear")):
+        with pytest.raises(InvalidDataError, match="'p' returned NaN actions"):
+            evaluate(walk_dataset, {"p": broken}, estimator, gamma=GAMMA, seeds=1, resamples=5)
+
+
+def test_a_policy_that_only_knows_probabilities_is_let_pass(real: minari.MinariDataset) -> None:
+    class Known(mdps.Table):
+        def sample(self, observations, *, rng):
+            raise NotImplementedError
+
+    rows = evaluate(real, Known(BEHAVIOR), IS, gamma=GAMMA, seeds=1, behavior=KNOWN, resamples=5).rows
+    assert rows[0]["value"] == pytest.approx(np.mean([(e.rewards * GAMMA ** np.arange(len(e))).sum() for e in real]))
+
+
+# --- data that Minari combined ---------------------------------------------------------------------------------------
+
+
+def test_combined_augmented_data_is_warned_of_and_combined_real_data_is_not(real: minari.MinariDataset) -> None:
+    saved = AugmentedDataset(real, Function(copied), factor=3, seed=0).save("test/augmented-v0")
+    other = make(10, seed=1, dataset_id="test/other-v0")
+    mixed = minari.combine_datasets([saved, other], "test/mixed-v0")
+    with pytest.warns(EstimationWarning, match=r"combined from augmented datasets \(test/augmented-v0\)"):
+        assert ope.Logged.of(mixed).n_units == 190  # copies count as real
+    both = minari.combine_datasets([real, other], "test/both-v0")
+    assert ope.Logged.of(both).n_units == 70
+    again = AugmentedDataset(both, Function(copied), factor=2, seed=0).save("test/again-v0")
+    assert ope.Logged.of(again).n_units == 70
+    minari.delete_dataset("test/other-v0")
+    assert ope.Logged.of(both).n_units == 70  # of a part that is gone nothing is said

@@ -12,10 +12,11 @@ import torch
 from oat_gym.errors import ConfigurationError, EstimationWarning, InvalidDataError
 from oat_gym.ope import FQE, Problem
 from oat_gym.ope import _q_tabular as tabular
+from oat_gym.ope._deviation import deviation
 from oat_gym.ope._fqe_network import Architecture, backward, first_weights, forward, views
 from oat_gym.ope._q_data import QData, RewardScale
 from oat_gym.ope._q_function import action_choices, step_weights, value_scale
-from oat_gym.ope._q_linear import finite_weights, infinite_weights
+from oat_gym.ope._q_linear import FeatureMap, finite_weights, infinite_weights
 from oat_gym.ope.fqe import _reasons
 from tests.ope import mdps
 
@@ -294,9 +295,10 @@ def test_values_that_have_not_settled_or_are_at_the_bounds_are_warned_of() -> No
         replace(SMALL, updates=200).estimate(problem, seeds=(0,))
     settled = {"late_change": 0.0, "share_clipped": 0.0}
     assert not _reasons(problem, SMALL, 3.0, settled, bounds=(-5.0, 5.0))
-    for value, numbers in ((5.5, settled), (4.9, settled | {"share_clipped": 0.3})):
+    clipped = settled | {"share_clipped": 0.3}
+    for value, numbers, where in ((5.5, {}, "lies outside what"), (4.9, clipped, "is at the bounds that")):
         found = _reasons(problem, SMALL, value, numbers, bounds=(-5.0, 5.0))
-        assert found == ["is at the bounds that the data's rewards allow, -5 to 5"]
+        assert found == [f"{where} the data's rewards allow, -5 to 5"]
 
 
 def test_targets_are_clipped_to_what_rewards_allow() -> None:
@@ -339,3 +341,37 @@ def test_the_dope_preset_has_the_reference_settings() -> None:
 def test_discount_sums() -> None:
     np.testing.assert_allclose(step_weights(0.5, 3), [0.0, 1.0, 1.5, 1.75])
     np.testing.assert_allclose(step_weights(1.0, 3), [0.0, 1.0, 2.0, 3.0])
+
+
+def test_constants_that_floats_cannot_hold_are_constants() -> None:
+    # the standard deviation of 1,000 times 0.1 is 1e-17 and not 0
+    problem = make_problem(300, features=np.eye(6), horizon=5)
+    data = QData.of(problem)
+    tenth = replace(data, rewards=np.full(len(data.rewards), 0.1))
+    assert tenth.rewards.std() > 0
+    assert RewardScale.of(tenth) == RewardScale(0.0, 1.0, 0.0, 0.1)
+    going = RewardScale.of(replace(tenth, terminated=np.zeros_like(data.terminated)))
+    assert (going.scale, going.low, going.high) == (1.0, going.low, going.low)
+    assert RewardScale.of(replace(tenth, rewards=30 * tenth.rewards)).scale == 3.0
+    assert RewardScale.of(data).scale == data.rewards.std()  # ordinary rewards: to the bit
+    x = np.random.default_rng(0).normal(3.0, 1e-3, size=(1000, 3))
+    x[:, 1] = 0.1
+    np.testing.assert_array_equal(deviation(x), x.std(axis=0) * [1, 0, 1])
+    scale = FeatureMap.of(x, x[:, :1], degree=1, discrete=True, one_hot=False).scale
+    np.testing.assert_array_equal(scale, np.where([True, False, True], x.std(axis=0), 1.0))
+
+
+def test_constant_rewards_are_worth_their_discounts() -> None:
+    problem = make_problem(300, features=np.eye(6), horizon=5)
+    steps = problem.data.steps
+    constant = replace(steps, rewards=np.full(len(steps), 0.1), terminated=np.zeros_like(steps.terminated))
+    assert constant.rewards.std() > 0
+    problem = replace(problem, data=replace(problem.data, steps=constant))
+    with quiet():
+        found = replace(SMALL, updates=300).estimate(problem, seeds=(0,))[0]
+    np.testing.assert_allclose(found.values, 0.1 * (1 - 0.9**5) / 0.1, rtol=0.02)
+    ending = replace(problem, data=replace(problem.data, steps=replace(constant, terminated=steps.terminated)))
+    with quiet():
+        found = replace(SMALL, updates=300).estimate(ending, seeds=(0,))[0]
+    assert (found.values > 0.1).all()
+    assert (found.values < 0.1 * (1 - 0.9**5) / 0.1).all()

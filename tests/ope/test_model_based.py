@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from oat_gym.errors import ConfigurationError, EstimationWarning, InvalidDataError, TrainingError
-from oat_gym.ope import FQE, ModelBased, PolicySet, Problem
+from oat_gym.ope import FQE, GaussianPolicy, ModelBased, PolicySet, Problem
 from oat_gym.ope._model_autoregressive import FactorTask, variables
 from oat_gym.ope._model_data import Moves, split
 from oat_gym.ope._model_ensemble import MeanTask, one_hot_draw
@@ -289,3 +289,33 @@ def test_broken_models_are_refused() -> None:
         ModelBased(model=Wrong()).estimate(problem, seeds=(0,))
     with pytest.raises(TrainingError, match="diverged"), np.errstate(all="ignore"):
         replace(TINY, learning_rate=1e30).estimate(problem, seeds=(0,))
+
+
+@pytest.mark.parametrize("kind", ["ensemble", "autoregressive"])
+def test_a_clock_does_not_swamp_the_held_out_error(kind: str) -> None:
+    # the clock t/H moves by the same step always, and its change varies by rounding only
+    length = 12
+    problem = linear.problem(GAINS, 60, length, gamma=0.9)
+    moves = Moves.of(problem)
+    clock = (problem.data.steps.step + 1) / length - problem.data.steps.step / length
+    noise = (clock - clock.mean())[:, None]
+    assert 0 < noise.var() < 1e-30
+    ticking = replace(moves, changes=np.concatenate((moves.changes[:, :1], noise), axis=1))
+    rows = torch.arange(len(noise))[None]
+    if kind == "ensemble":
+        task = MeanTask(ticking.inputs, ticking.changes, hidden=(4,), device="cpu")
+        heads = torch.zeros(1, len(noise), 2) + torch.tensor([0.0, 1e-3])  # a network that is off by 0.001
+        assert float(task.squared_error(heads, rows).mean()) == pytest.approx(1.0, rel=1e-3)
+        return
+    factors = FactorTask(ticking, variables(ticking), hidden=(4,), device="cpu")
+    heads = torch.full((3, len(noise), 2), 1e-3)
+    error = factors.squared_error(heads, rows).mean(dim=1)
+    assert error.tolist() == pytest.approx([1.0, 1e-6, 1.0], rel=1e-2)
+
+
+def test_nan_actions_are_found_before_training() -> None:
+    problem = linear.problem(GAINS, 20, 5, gamma=0.9)
+    broken = GaussianPolicy(lambda s: np.where(s[:, :1] > 1.0, np.nan, 0.0), 0.1)
+    problem = replace(problem, policies=PolicySet.of({"good": linear.policy(0.0), "broken": broken}))
+    with pytest.raises(InvalidDataError, match="'broken' returned NaN actions"):
+        replace(TINY, updates=10**9).estimate(problem, seeds=(0,))

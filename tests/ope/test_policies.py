@@ -1,6 +1,7 @@
 """The adapters: what they sample, the log-probabilities they give, and what they refuse."""
 
 import subprocess
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -8,9 +9,12 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from torch.distributions import AffineTransform, TanhTransform, TransformedDistribution
 
 from oat_gym import ope
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError
+from oat_gym.generation.distributions import Gaussian
+from oat_gym.ope._densities import tanh_gaussian_log_prob
 from oat_gym.spaces import FlatSpace
 
 BOX = spaces.Box(-1, 1, (2,))
@@ -199,6 +203,16 @@ def test_a_squashed_perceptron_is_a_density_inside_its_bounds() -> None:
     np.testing.assert_allclose(np.tanh(np.arctanh(policy.mean(np.array([[0.3]])))), policy.mean(np.array([[0.3]])))
 
 
+def test_targets_and_clones_read_saturated_actions_at_one_edge() -> None:
+    # the mean of the first unit and the log standard deviation are constants: mean 2, deviation 1
+    one = (np.zeros((1, 1)), np.array([2.0])), (np.zeros((1, 1)), np.zeros(1))
+    target = ope.MLPPolicy((), *one, action_space=spaces.Box(-1, 1, (1,)), squash=True)
+    for action in (1.0, -1.0, 1 - 1e-5, 0.3):
+        clone = tanh_gaussian_log_prob(Gaussian(torch.tensor([2.0]), torch.tensor([1.0])), torch.tensor([action]))
+        ours = target.log_prob(np.zeros((1, 1)), np.array([[action]]))
+        assert ours[0] == pytest.approx(clone.item(), rel=1e-3)
+
+
 def test_a_perceptron_clips_to_the_shape_and_dtype_of_its_space() -> None:
     box = spaces.Box(-0.1, 0.1, (2, 3))
     policy = perceptron((4, 16, 6), action_space=box)
@@ -303,6 +317,60 @@ def test_torch_policies_name_wrong_outputs() -> None:
         ope.TorchPolicy(Net(2), BOX).mean({"x": np.zeros((1, 3))})
     with pytest.raises(InvalidDataError, match=r"shape \(1, 2\)"):
         ope.TorchPolicy(lambda s: (Net(3)(s), torch.zeros(3)), BOX).mean(np.zeros((1, 3)))
+
+
+def squashed(
+    scale: float | None = None, *, wrap: bool = True
+) -> Callable[[torch.Tensor], torch.distributions.Distribution]:
+    """Return SAC's policy: the tanh of a Gaussian around the state, times `scale`."""
+
+    def law(states: torch.Tensor) -> torch.distributions.Distribution:
+        base = torch.distributions.Normal(states, 0.5 * torch.ones_like(states))
+        transforms = [TanhTransform(), *([] if scale is None else [AffineTransform(0.5, scale)])]
+        found = TransformedDistribution(base, transforms)
+        return torch.distributions.Independent(found, 1) if wrap else found
+
+    return law
+
+
+@pytest.mark.parametrize("wrap", [True, False])
+@pytest.mark.parametrize(("scale", "middle"), [(None, 0.0), (2.0, 0.5), (-3.0, 0.5)])
+def test_a_squashed_torch_policy_has_a_mean_and_finite_densities(
+    scale: float | None, middle: float, wrap: bool
+) -> None:
+    size = scale or 1.0
+    box = spaces.Box(middle - abs(size), middle + abs(size), (2,))
+    policy = ope.TorchPolicy(squashed(scale, wrap=wrap), box)
+    states = rng().normal(size=(6, 2))
+    np.testing.assert_allclose(policy.mean(states), middle + size * np.tanh(states), rtol=1e-4, atol=1e-5)
+    assert np.isin(policy.sample(states, rng=rng()), policy.mean(states)).sum() == 0
+    at_edge = np.broadcast_to([box.low[0], box.high[1]], (6, 2))
+    inner = middle + (at_edge - middle) * (1 - 1e-4)
+    found = policy.log_prob(states, at_edge)
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found, policy.log_prob(states, inner), rtol=1e-3)
+    before = np.arctanh(np.array([0.2, -0.4]))
+    expected = (
+        -0.5 * ((before - states) / 0.5) ** 2 - np.log(0.5 * np.sqrt(2 * np.pi)) - np.log(1 - np.tanh(before) ** 2)
+    )
+    inside = policy.log_prob(states, np.tile(middle + size * np.array([0.2, -0.4]), (6, 1)))
+    np.testing.assert_allclose(inside, (expected - np.log(abs(size))).sum(axis=1), rtol=1e-4)
+
+
+def test_a_distribution_without_a_center_needs_its_mean_given() -> None:
+    def law(states: torch.Tensor) -> torch.distributions.Distribution:
+        mixing = torch.distributions.Categorical(torch.ones(len(states), 2))
+        parts = torch.distributions.Independent(squashed(wrap=False)(states[:, None].expand(-1, 2, -1)), 1)
+        return torch.distributions.MixtureSameFamily(mixing, parts)
+
+    states = rng().normal(size=(4, 2))
+    with pytest.raises(ConfigurationError, match=r"neither mean nor mode.*give mean_module="):
+        ope.TorchPolicy(law, BOX).mean(states)
+    given = ope.TorchPolicy(law, BOX, mean_module=lambda s: s.tanh(), deterministic=True)
+    np.testing.assert_allclose(given.mean(states), np.tanh(states), rtol=1e-5)
+    np.testing.assert_array_equal(given.sample(states, rng=rng()), given.mean(states))
+    with pytest.raises(InvalidDataError, match="mean_module must return a tensor, got list"):
+        ope.TorchPolicy(law, BOX, mean_module=lambda s: [0.0]).mean(states)
 
 
 # DOPE's weight files
