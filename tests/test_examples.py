@@ -19,7 +19,7 @@ def test_example(path: Path, tmp_path: Path) -> None:
     run = subprocess.run(
         [sys.executable, str(path)],
         cwd=here,
-        env={**os.environ, "TMPDIR": str(temporary)},
+        env={**os.environ, "TMPDIR": str(temporary), "TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "torch")},
         capture_output=True,
         text=True,
         check=False,

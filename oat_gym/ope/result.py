@@ -103,6 +103,30 @@ class Result:
             rows.append(head | {"difference": change, "standard_error": error} | tail)
         return rows
 
+    def within(self, low: float, high: float) -> Result:
+        """Return the result with each estimate moved to the nearest value in [low, high], what policies can earn.
+
+        An estimate of a value in the range comes no further from it by that, whatever the estimator, and one that
+        diverged no longer hides what others say. The range has to hold for every policy: what an episode pays where it
+        pays once, or `ope.intervals.return_bounds` of the least and the greatest reward. Recorded returns are no such
+        range.
+
+        Replicates are moved too, for `differences` and `over_seeds`; intervals are cut to the range, and standard
+        errors stay as they were. Near an end the estimators that were unbiased are so no longer. The diagnostic
+        `outside_range` says by how much an estimate lay outside: a large one is a reason to distrust what is left.
+
+        Raises:
+            ConfigurationError: unless low < high are finite numbers.
+        """
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise ConfigurationError(f"within needs two finite numbers, low < high, got {low!r} and {high!r}.")
+        rows: list[Row] = []
+        for row in self.rows:
+            moved = {name: float(np.clip(row[name], low, high)) for name in ("value", "low", "high")}
+            outside = {"outside_range": float(row["value"]) - moved["value"]}
+            rows.append(row | moved | {"diagnostics": row["diagnostics"] | outside})
+        return Result(self.question, rows, {key: draws.clip(low, high) for key, draws in self.draws.items()})
+
     def over_seeds(self) -> list[Row]:
         """Return the average over the seeds: a row for each policy and estimator (and data, where paired).
 

@@ -480,3 +480,21 @@ def test_combined_augmented_data_is_warned_of_and_combined_real_data_is_not(real
     assert ope.Logged.of(again).n_units == 70
     minari.delete_dataset("test/other-v0")
     assert ope.Logged.of(both).n_units == 70  # of a part that is gone nothing is said
+
+
+def test_estimates_are_kept_within_what_policies_can_earn(real: minari.MinariDataset) -> None:
+    """Copies that pay more move one side beyond the range: what is left of the difference is what the range allows."""
+    plain = ask(AugmentedDataset(real, Function(louder), factor=2), paired=True, use_augmented="all", resamples=50)
+    values = {row["data"]: row["value"] for row in plain.rows if row["policy"] == "same"}
+    low, high = values["real"] - 100.0, (values["real"] + values["augmented"]) / 2
+    moved = plain.within(low, high)
+    assert all(low <= row[name] <= high for row in moved.rows for name in ("value", "low", "high"))
+    for row, before in zip(moved.rows, plain.rows, strict=True):
+        assert row["diagnostics"]["outside_range"] == pytest.approx(before["value"] - row["value"])
+        assert row["standard_error"] == before["standard_error"]
+    difference = next(row for row in moved.differences if row["policy"] == "same")["difference"]
+    assert difference == pytest.approx(high - values["real"])
+    assert plain.within(-1e9, 1e9).compare(dict.fromkeys(POLICIES, 0.0)) == plain.compare(dict.fromkeys(POLICIES, 0.0))
+    for wrong in ((1.0, 1.0), (0.0, math.inf)):
+        with pytest.raises(ConfigurationError, match="low < high"):
+            plain.within(*wrong)
