@@ -184,6 +184,8 @@ def _verdict_text(found: Finding | None) -> str:
         return "-"
     change = found.improvement
     numbers = [format_number(number) for number in (change.value, change.low, change.high)]
+    if not math.isfinite(change.low):
+        return f"{numbers[0]} (no interval)"
     words = ("helps", "hurts") if found.baseline == NONE else ("better", "worse")
     word = {"helps": f" {words[0]}", "hurts": f" {words[1]}"}.get(change.verdict, "")
     return f"{numbers[0]} ({numbers[1]} to {numbers[2]}){word}"
