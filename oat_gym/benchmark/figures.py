@@ -101,7 +101,8 @@ def _mark_cut(axes: Axes, change: Improvement, y: float) -> None:
 
 def _limit(axes: Axes, changes: Sequence[Improvement], *, marks: Sequence[float] = ()) -> None:
     """Keep one interval that is far wider than the values from hiding all others; it then leaves the picture."""
-    values = np.array([abs(change.value) for change in changes if math.isfinite(change.value)])
+    signed = np.array([change.value for change in changes if math.isfinite(change.value)])
+    values = np.abs(signed)
     ends = np.array([e for change in changes for e in (change.low, change.high) if math.isfinite(e)])
     axes.locator_params(axis="x", nbins=5)
     if not len(values):
@@ -110,8 +111,9 @@ def _limit(axes: Axes, changes: Sequence[Improvement], *, marks: Sequence[float]
     shown = np.array([number for number in marks if math.isfinite(number)])
     reach = max(3.0 * float(np.quantile(values, 0.75)), 1.15 * float(np.abs([*values, *shown]).max()))
     reach = reach if reach > 1e-6 else max(float(np.abs(ends).max(initial=0.0)), 0.1)
-    low = max(float(min(ends.min(initial=0.0), shown.min(initial=0.0), -values.max() * 0.05)), -reach)
-    high = min(float(max(ends.max(initial=0.0), shown.max(initial=0.0), values.max() * 0.05)), reach)
+    there = np.concatenate([signed, ends, shown])
+    low = max(float(min(there.min(), -values.max() * 0.05)), -reach)
+    high = min(float(max(there.max(), values.max() * 0.05)), reach)
     axes.set_xlim(1.05 * low - 1e-3 * reach, 1.05 * high + 1e-3 * reach)
 
 

@@ -83,7 +83,8 @@ def sentence(found: Finding, *, of: str, part: str = "") -> str:
     better = change.value >= 0
     ends = (change.low, change.high) if better else (-change.high, -change.low)
     size, low, high = (format_number(number) for number in (abs(change.value), *ends))
-    ends = f"95% interval {low} to {high}" + (f"; {part}" if part else "")
+    told = f"95% interval {low} to {high}" if math.isfinite(change.low) else "no interval"
+    ends = told + (f"; {part}" if part else "")
     what = {
         "mae": f"{'lowers' if better else 'raises'} the error by {size}% ({ends})",
         "rank_correlation": f"{'raises' if better else 'lowers'} the rank correlation by {size} ({ends})",
@@ -136,13 +137,19 @@ def _verdict(found: Finding | None) -> dict[str, str]:
         return {"word": "not measured", "style": "none", "number": "", "interval": ""}
     change = found.improvement
     unit = "%" if found.metric == "mae" else ""
-    numbers = [format_number(number) for number in (change.value, change.low, change.high)]
     return {
         "word": change.verdict,
         "style": {"helps": "good", "hurts": "bad"}.get(change.verdict, "open"),
-        "number": ("+" if change.value >= 0 else "") + numbers[0] + unit,
-        "interval": f"{numbers[1]} to {numbers[2]}" if change.n_seeds > 1 else "one seed",
+        "number": ("+" if change.value >= 0 else "") + format_number(change.value) + unit,
+        "interval": "one seed" if change.n_seeds < 2 else _interval(change),
     }
+
+
+def _interval(change: Improvement) -> str:
+    """Return an interval, or that there is none: too few policies are left in resamples to say."""
+    if not math.isfinite(change.low):
+        return "no interval"
+    return f"{format_number(change.low)} to {format_number(change.high)}"
 
 
 def best_sentences(analysis: Analysis, group: Group) -> list[str]:
