@@ -95,9 +95,10 @@ def check_seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
     Raises:
         ConfigurationError: for no seed, a repeated one, or one that is no non-negative integer.
     """
-    if isinstance(seeds, int | np.integer):
-        seeds = range(0 if isinstance(seeds, bool) else int(seeds))
-    numbers = tuple(check_seed(seed) for seed in seeds)
+    chosen: Sequence[int] = (
+        seeds if not isinstance(seeds, int | np.integer) else range(0 if isinstance(seeds, bool) else int(seeds))
+    )
+    numbers = tuple(check_seed(seed) for seed in chosen)
     if not numbers or len(set(numbers)) != len(numbers):
         raise ConfigurationError(f"seeds must be a positive number of seeds, or different seeds, got {seeds!r}.")
     return numbers

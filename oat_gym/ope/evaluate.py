@@ -298,7 +298,9 @@ def _dataset(data: MinariDataset | str | PathLike[str]) -> MinariDataset:
     if isinstance(data, str | PathLike):
         return find_source(data)
     if not isinstance(data, MinariDataset):
-        raise ConfigurationError(f"data must be a Minari dataset, its id or a D4RL file's path, got {data!r}.")
+        raise ConfigurationError(
+            f"data must be a Minari dataset, its id or a D4RL file's path, got a {type(data).__name__}."
+        )
     return data
 
 
