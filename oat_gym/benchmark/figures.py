@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -61,7 +62,7 @@ def improvement_bars(panels: Sequence[Panel], *, title: str, columns: int = 2) -
     for axes in grid.ravel()[len(panels) :]:
         axes.set_axis_off()
     _key(figure, with_paper=any(np.isfinite(panel.paper).any() for panel in panels if len(panel.paper)))
-    figure.suptitle(title, fontsize=_TEXT + 1)
+    figure.suptitle(textwrap.fill(title, 45 * min(columns, len(panels))), fontsize=_TEXT + 1)
     return figure
 
 
