@@ -1,4 +1,4 @@
-"""What is known of the numbers of `diagnose_steps.py` before they are computed, and that the script goes on."""
+"""What is known of the numbers of the diagnoses before they are computed, and that a killed one goes on."""
 
 import csv
 import dataclasses
@@ -14,12 +14,13 @@ from gymnasium import spaces
 from minari import MinariDataset
 
 from oat_gym import AugmentedDataset, Function, Jittering, Scaling, domains
+from oat_gym.benchmark.analysis import Analysis
 from oat_gym.benchmark.grid import format_number
 from oat_gym.benchmark.plan import make_plan, write_manifest
 from oat_gym.benchmark.protocol import Question
-from oat_gym.benchmark.results import read_results
+from oat_gym.benchmark.results import Results, read_results
 from oat_gym.benchmark.runner import run
-from oat_gym.benchmark.variants import parse_variants
+from oat_gym.benchmark.variants import NONE, parse_variants
 from oat_gym.metrics.steps import Scale, Steps
 from oat_gym.ope import PolicySet
 from oat_gym.spaces import FlatSpace
@@ -28,14 +29,18 @@ from tests.benchmark import tiny
 SCRIPT = Path(__file__).with_name("diagnose_steps.py")
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("diagnose_steps", SCRIPT)
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, SCRIPT.with_name(f"{name}.py"))
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    return load("diagnose_steps")
 
 
 @pytest.fixture(scope="module")
@@ -128,10 +133,7 @@ def test_rows_that_are_there_are_not_computed_again(tmp_path: Path) -> None:
 
 
 def test_ends_that_are_generated_are_counted_with_their_rewards(tmp_path: Path) -> None:
-    spec = importlib.util.spec_from_file_location("diagnose_ends", SCRIPT.with_name("diagnose_ends.py"))
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load("diagnose_ends")
     whole = domains.load("maze2d-umaze")
     real = MinariDataset(whole.storage, episode_indices=whole.episode_indices[:4])
     found = module.ends(AugmentedDataset(real, Scaling(sigma=0.5), factor=3, seed=0), 4)
@@ -153,17 +155,20 @@ def test_ends_that_are_generated_are_counted_with_their_rewards(tmp_path: Path) 
     assert len((tmp_path / "ends.csv").read_text().splitlines()) == 4
 
 
-def test_estimates_are_kept_within_what_policies_can_earn(tmp_path: Path) -> None:
-    spec = importlib.util.spec_from_file_location("diagnose_range", SCRIPT.with_name("diagnose_range.py"))
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    budget = dataclasses.replace(tiny.BUDGET, estimators=tiny.BUDGET.estimators[:1])
+def benchmark(folder: Path, variants: str, *, estimators: int) -> Results:
+    """Return the results of a tiny benchmark with two seeds."""
+    budget = dataclasses.replace(tiny.BUDGET, estimators=tiny.BUDGET.estimators[:estimators])
     settings = {"question": Question(resamples=20, resets=5), "budget": budget, "catalog": tiny.CATALOG}
-    plan = make_plan(tiny.SUITE, parse_variants("jittering"), seeds=(0, 1), **settings)
-    write_manifest(tmp_path, plan, seeds=(0, 1), device="cpu", command="bench")
-    run(plan, tmp_path, catalog=tiny.CATALOG)
-    (results,) = read_results(tmp_path)
+    plan = make_plan(tiny.SUITE, parse_variants(variants), seeds=(0, 1), **settings)
+    write_manifest(folder, plan, seeds=(0, 1), device="cpu", command="bench")
+    run(plan, folder, catalog=tiny.CATALOG)
+    (results,) = read_results(folder)
+    return results
+
+
+def test_estimates_are_kept_within_what_policies_can_earn(tmp_path: Path) -> None:
+    module = load("diagnose_range")
+    results = benchmark(tmp_path, "jittering", estimators=1)
     true, family = results.cells[0].true, results.families[0]
     module.OUTCOMES = {name: (true.mean(), true.mean()) for name in results.datasets}
     module.FAMILIES = (family,)
@@ -173,3 +178,30 @@ def test_estimates_are_kept_within_what_policies_can_earn(tmp_path: Path) -> Non
     assert all(row["jittering within"] == "0 (0 to 0)" for row in (*rows, whole))  # one value is left for all
     module.write(tmp_path, [*rows, whole])
     assert len((tmp_path / "range.csv").read_text().splitlines()) == len(rows) + 2
+
+
+def test_synthetic_data_go_to_the_estimators_that_gained_elsewhere(tmp_path: Path) -> None:
+    module = load("diagnose_use")
+    variants = ["jittering", "scaling"]
+    results = benchmark(tmp_path, "jittering,scaling", estimators=2)
+    module.CHOICE = module.REPORT = results.datasets
+    effects = module.gains(results, variants)
+    plain = Analysis(results)
+    for family, found in effects.items():
+        for name, effect in found.items():
+            errors = [plain.scores(results.datasets[0], side, family, "mae").mean() for side in (NONE, name)]
+            assert effect == pytest.approx(np.log(errors[0] / errors[1]))
+    first, second = effects
+    made = {first: {"jittering": 0.2, "scaling": 0.3}, second: {"jittering": -0.1, "scaling": -0.2}}
+    choice = module.choices(made, variants)
+    assert choice["jittering"] == {first: "jittering", second: NONE}
+    assert choice["best"] == {first: "scaling", second: NONE}
+    chosen = Analysis(module.composed(results, choice["best"]))
+    error = chosen.scores(results.datasets[0], module.CHOSEN, first, "mae")
+    assert error.tolist() == plain.scores(results.datasets[0], "scaling", first, "mae").tolist()
+    unchanged = chosen.finding(results.datasets[0], module.CHOSEN, second, "mae")
+    assert unchanged is not None and unchanged.improvement.value == 0
+    rows = module.rows_of(tmp_path, variants)
+    assert [row["method"] for row in rows] == [*variants, "best"]
+    module.write(tmp_path, rows)
+    assert len((tmp_path / "use.csv").read_text().splitlines()) == len(rows) + 1
