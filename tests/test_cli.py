@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import errno
 import subprocess
 import sys
 import warnings
@@ -161,6 +162,23 @@ def test_where_nothing_can_be_written_it_is_said_before_the_work(
     assert "--out" in str(result.exception)
     assert "cannot be written: the folder" in str(result.exception)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_augment_finds_a_folder_that_takes_no_files_before_the_work(
+    walk_dataset: minari.MinariDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(**_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    def work(*_: object, **__: object) -> None:
+        raise AssertionError("this is work")
+
+    monkeypatch.setattr("oat_gym.cli._output.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("oat_gym.cli.augment.AugmentedDataset.fit", work)
+    result = CliRunner().invoke(cli.app, ["augment", "test/walks-v0", "--augmenter", "jittering"])
+    assert isinstance(result.exception, SaveError), result.output
+    assert "MINARI_DATASETS_PATH" in str(result.exception)
+    assert "Permission denied" in str(result.exception)
 
 
 def test_a_file_in_the_place_of_a_folder_and_the_other_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

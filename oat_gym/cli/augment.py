@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import typer
+from minari.storage import get_dataset_path
 
 from oat_gym.augmenters import AUGMENTERS
+from oat_gym.cli._output import prepare_folder
 from oat_gym.cli._shared import Dataset, Factor, Seed, configure, length_advice, open_source, out
 from oat_gym.dataset import AugmentedDataset
 from oat_gym.errors import ConfigurationError
@@ -40,6 +42,7 @@ def augment(
         data = AugmentedDataset(source, method, factor=factor, seed=seed)
         check_dataset_id(target)
         chosen = _data_format(data_format)
+        prepare_folder(get_dataset_path().resolve(), option="Minari's folder of datasets, MINARI_DATASETS_PATH,")
         if not lazy:
             with progress_bar() as progress:
                 data.fit(progress=progress)
