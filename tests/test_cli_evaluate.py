@@ -74,6 +74,21 @@ def test_augmented_episodes_are_paired_and_the_truth_is_compared(
     assert "covers training False: Resamples do not reach what was fitted" in changes
 
 
+def test_estimates_are_kept_within_what_policies_can_earn(
+    walk_dataset: minari.MinariDataset, policies: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "values.csv"
+    arguments = ["--policies", str(policies), "--horizon", "6", "--out", str(file)]
+    with pytest.warns(EstimationWarning):
+        evaluate(*arguments)
+        free = [float(row["value"]) for row in csv.DictReader(file.read_text().splitlines())]
+        middle = sum(free) / 2
+        evaluate(*arguments, "--within", str(middle), str(max(free) + 1))
+    kept = [float(row["value"]) for row in csv.DictReader(file.read_text().splitlines())]
+    assert min(free) < middle
+    assert kept == [max(value, middle) for value in free]
+
+
 def test_a_dataset_of_no_task_needs_policies(walk_dataset: minari.MinariDataset) -> None:
     with pytest.raises(ConfigurationError, match=r"no task named 'test/walks-v0'.*Give --policies"):
         evaluate()
@@ -134,6 +149,8 @@ def test_estimates_are_kept_where_no_true_value_is_known(
     [
         (["--estimators", "magic"], ConfigurationError, "no estimator 'magic'"),
         (["--use-augmented", "half"], ConfigurationError, "--use-augmented must be one of"),
+        (["--within", "1", "-1"], ConfigurationError, "within needs two finite numbers, low < high, got 1.0 and -1.0"),
+        (["--within", "0", "inf"], ConfigurationError, "within needs two finite numbers"),
         (["--seeds", "0"], ConfigurationError, "--seeds must be at least 1, got 0"),
         (["--behavior", "guess"], ConfigurationError, "--behavior must be one of clone, logged"),
         (["--augmenter", "magic"], ConfigurationError, "no augmenter 'magic'"),

@@ -20,21 +20,29 @@ from oat_gym.cli._output import prepare_file
 from oat_gym.cli._shared import Dataset, Factor, Seed, check_choice, find_augmenter, length_advice, open_source, out
 from oat_gym.dataset import AugmentedDataset
 from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError
-from oat_gym.ope.result import PARTIAL
+from oat_gym.ope.result import PARTIAL, check_range
 from oat_gym.progress import progress_bar
 from oat_gym.spaces import Batch
 
 _RESETS = 200
 _LENGTH_ADVICE = "Use `oat-gym augment --length {length}` first, and evaluate what it writes."
 _PARTS: dict[str, ope.UseAugmented] = {"training": None, "all": "all", "none": "none"}
+Policies = Annotated[
+    str | None, typer.Option(help="Folder of policy weights (npz, as DOPE's), or a task; else the task of DATASET.")
+]
+Use = Annotated[str, typer.Option(help=f"What sees synthetic episodes: {', '.join(_PARTS)}.")]
+Initial = Annotated[
+    str, typer.Option(help="Where values count from: data (its first states), or reset (the task's environment).")
+]
+Within = Annotated[
+    tuple[float, float] | None,
+    typer.Option(metavar="LOW HIGH", help="What policies can earn: estimates beyond are moved to the nearer one."),
+]
 
 
 def evaluate(
     dataset: Dataset,
-    policies: Annotated[
-        str | None,
-        typer.Option(help="Folder of policy weights (npz, as DOPE's), or a task; else the task of DATASET."),
-    ] = None,
+    policies: Policies = None,
     estimators: Annotated[str, typer.Option(help=f"all, or some of {','.join(ope.ESTIMATORS)}.")] = "all",
     gamma: Annotated[float | None, typer.Option(help="Discount; else the task's, or 0.995.")] = None,
     horizon: Annotated[int | None, typer.Option(help="Steps whose rewards count; else the task's, or all.")] = None,
@@ -42,14 +50,11 @@ def evaluate(
     augmenter: Annotated[str, typer.Option(help=f"none, or one of {', '.join(AUGMENTERS)}.")] = "none",
     factor: Factor = 10,
     seed: Seed = 0,
-    use_augmented: Annotated[
-        str, typer.Option(help=f"What sees synthetic episodes: {', '.join(_PARTS)}.")
-    ] = "training",
+    use_augmented: Use = "training",
     behavior: Annotated[str, typer.Option(help="Behaviour policy: clone, or logged (infos['log_prob']).")] = "clone",
     truth: Annotated[Path | None, typer.Option(help="CSV of true values, columns policy and value.")] = None,
-    initial: Annotated[
-        str, typer.Option(help="Where values count from: data (its first states), or reset (the task's environment).")
-    ] = "data",
+    initial: Initial = "data",
+    within: Within = None,
     file: Annotated[Path | None, typer.Option("--out", help="CSV file for every estimate.")] = None,
 ) -> None:
     """Estimate what each policy would earn, from the episodes of DATASET.
@@ -64,6 +69,8 @@ def evaluate(
     check_choice("--behavior", behavior, ("clone", "logged"))
     if seeds < 1:
         raise ConfigurationError(f"--seeds must be at least 1, got {seeds}.")
+    if within is not None:
+        check_range(*within)
     given = None if truth is None else read_truth(truth)
     data = _data(dataset, augmenter, factor, seed)
     targets, task = _targets(policies, dataset, data)
@@ -89,6 +96,7 @@ def evaluate(
             paired=isinstance(data, AugmentedDataset) and use_augmented != "none",
             progress=progress,
         )
+    result = result if within is None else result.within(*within)
     _tell(result, known, file, elsewhere=starts is None and task is not None and task.initial_states is not None)
 
 

@@ -240,16 +240,17 @@ def _warn_of_values(found: tuple[Estimates, ...], run: _Run) -> None:
         horizon = int(problem.data.lengths.max())
     low, high = return_bounds(float(rewards.min()), float(rewards.max()), gamma=problem.gamma, horizon=horizon)
     values, slack = np.stack([estimates.values for estimates in found]), 1e-6 * max(high - low, 1e-12)
+    outside = (values < low - slack) | (values > high + slack)
     findings = (
-        (~np.isfinite(values), "not finite"),
-        ((values < low - slack) | (values > high + slack), f"beyond what the rewards allow ({low:.4g} to {high:.4g})"),
+        (~np.isfinite(values), "not finite", ""),
+        (outside, f"beyond what the rewards allow ({low:.4g} to {high:.4g})", " `Result.within` moves them there."),
     )
-    for bad, what in findings:
+    for bad, what, advice in findings:
         if bad.any():
             where = tuple(int(index) for index in np.argwhere(bad)[0])
             warnings.warn(
                 f"{run.estimator.name}: {int(bad.sum())} of {bad.size} values are {what}, such as {values[where]:.4g} "
-                f"for policy {problem.policies.names[where[1]]!r}.",
+                f"for policy {problem.policies.names[where[1]]!r}.{advice}",
                 EstimationWarning,
                 stacklevel=2,
             )

@@ -118,8 +118,7 @@ class Result:
         Raises:
             ConfigurationError: unless low < high are finite numbers.
         """
-        if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise ConfigurationError(f"within needs two finite numbers, low < high, got {low!r} and {high!r}.")
+        check_range(low, high)
         rows: list[Row] = []
         for row in self.rows:
             moved = {name: float(np.clip(row[name], low, high)) for name in ("value", "low", "high")}
@@ -247,6 +246,12 @@ class Result:
 
     def _spread(self, value: float, draws: FloatArray) -> tuple[float, float, float]:
         return spread(value, draws, self.question)
+
+
+def check_range(low: float, high: float) -> None:
+    """Raise unless low < high are finite numbers (`Result.within`)."""
+    if not -math.inf < low < high < math.inf:
+        raise ConfigurationError(f"within needs two finite numbers, low < high, got {low!r} and {high!r}.")
 
 
 def spread(value: float, draws: FloatArray, question: Question) -> tuple[float, float, float]:
