@@ -29,6 +29,11 @@ def derive(seed: int, *keys: int | str) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(check_seed(seed), spawn_key=words))
 
 
+def reset_seeds(count: int, seed: int, *keys: int | str) -> list[int]:
+    """Return seeds of `count` resets of an environment; those of neighbouring `seed`s do not overlap."""
+    return [int(value) for value in derive(seed, *keys).integers(0, 2**31 - 1, size=count)]
+
+
 def torch_generator(rng: np.random.Generator, device: str | torch.device = "cpu") -> torch.Generator:
     """Return a torch generator seeded by one draw from `rng`; torch's global state is not touched."""
     generator = torch.Generator(device=device)

@@ -97,9 +97,11 @@ def initial_states(name: str, *, count: int = 200, seed: int = 0) -> Batch:
     """Return observations where a task's environment starts episodes, `count` of them.
 
     Raises:
-        ConfigurationError: for an unknown task, or one without an environment.
+        ConfigurationError: for an unknown task, one without an environment, or a count below 1.
     """
     found = task(name)
+    if count < 1:
+        raise ConfigurationError(f"count must be at least 1, got {count}.")
     if found.initial_states is None:
         raise ConfigurationError(f"{name!r} has no environment to start episodes in; use its data's first states.")
     return found.initial_states(count, seed)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import SyncVectorEnv
 
-from oat_gym._rng import derive
+from oat_gym._rng import reset_seeds
 from oat_gym.domains.adroit_rewards import AdroitTask, adroit_task, d4rl_reward
 
 FloatArray = npt.NDArray[np.float64]
@@ -77,8 +77,7 @@ def env_spec(name: str) -> EnvSpec:
 def reset_observations(name: str, count: int, seed: int) -> FloatArray:
     """Return the observations (count, D) of `count` resets of a task's environment."""
     env = make_env(name)
-    seeds = derive(seed, "adroit resets", name).integers(0, 2**31 - 1, size=count)
-    rows = [env.reset(seed=int(value))[0] for value in seeds]
+    rows = [env.reset(seed=value)[0] for value in reset_seeds(count, seed, "adroit resets", name)]
     env.close()
     return np.stack(rows)
 

@@ -21,6 +21,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 from minari.data_collector import EpisodeBuffer
 
+from oat_gym._rng import reset_seeds
 from oat_gym.domains._data import generated
 from oat_gym.domains._sepsis_clinician import Clinician
 from oat_gym.domains.dqn import QNetwork
@@ -164,7 +165,8 @@ def truth(gamma: float) -> Truth:
 
 def initial_states(count: int, seed: int) -> Batch:
     """Return observations of `count` patients on admission."""
-    return open_ward(count).reset(seed=seed)[0]
+    of_each: Any = reset_seeds(count, seed, "sepsis-sim resets")
+    return open_ward(count).reset(seed=of_each)[0]
 
 
 DATASETS: dict[str, Callable[[], minari.MinariDataset]] = {NAME: load}

@@ -18,6 +18,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 
+from oat_gym._rng import reset_seeds
 from oat_gym.domains._data import generated
 from oat_gym.domains.dqn import DQN, QNetwork
 from oat_gym.domains.rollout import Recording, RollOuts, roll_out
@@ -137,7 +138,7 @@ def truth(gamma: float = GAMMA) -> Truth:
 
 def initial_states(count: int, seed: int) -> Batch:
     """Return the first observations of `count` new students."""
-    return tutor.TutorVectorEnv(count).reset(seed=seed)[0]
+    return tutor.TutorVectorEnv(count).reset(seed=reset_seeds(count, seed, "tutor-sim resets"))[0]
 
 
 DATASETS: dict[str, Callable[[], minari.MinariDataset]] = {

@@ -33,6 +33,8 @@ def test_what_nobody_knows_is_said():
         domains.truth("sepsis")
     with pytest.raises(OatGymError, match="'sepsis' has no environment"):
         domains.initial_states("sepsis")
+    with pytest.raises(OatGymError, match="count must be at least 1, got 0"):
+        domains.initial_states("tutor-sim", count=0)
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,12 @@ def test_students_are_the_same_whatever_the_policy():
         np.testing.assert_array_equal(one.observations[0], two.observations[0])
 
 
+def test_initial_states_of_two_seeds_are_of_different_students():
+    first, again, other = (domains.initial_states("tutor-sim", count=20, seed=seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert {row.tobytes() for row in first}.isdisjoint(row.tobytes() for row in other)
+
+
 def test_there_are_the_papers_four_policies():
     policies = domains.policies("tutor-sim")
     states = domains.initial_states("tutor-sim", count=50, seed=3)
