@@ -22,6 +22,9 @@ from oat_gym.spaces import iter_leaf_spaces
 MAX_COUNT = 10_000_000
 """Most synthetic episodes of one dataset: a plan keeps a length for each, and a recipe may ask for anything."""
 
+_SAMPLING = 2
+"""In the name of each stored variation: raise it when a change alters what models that are stored generate."""
+
 
 class Synthesis:
     """`count` synthetic episodes of `source` by `augmenter`, of which nothing is made before it is asked for.
@@ -118,10 +121,11 @@ class Synthesis:
         self._sampler = sampler
 
     def _variation_material(self, entry: CacheEntry, sampler: Sampler, k: int) -> Any:
-        stored = entry.read(f"variation-{k}")
+        name = f"variation-{_SAMPLING}-{k}"
+        stored = entry.read(name)
         if stored is None:
             stored = sampler.generate(k), None
-            entry.write(f"variation-{k}", *stored)
+            entry.write(name, *stored)
         return sampler.decode(stored[0])
 
     @cached_property

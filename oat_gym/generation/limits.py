@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from oat_gym.generation.normalizer import CONSTANT
 from oat_gym.spaces import FloatMatrix, Layout
 
 Bounds = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
@@ -62,6 +63,15 @@ class Limits:
             (float(low[0]), float(high[0])),
         )
 
+    def holding(self, own: Limits) -> Limits:
+        """Return these limits, shut where `own`, those of training spans, let a state column or the reward not vary.
+
+        A network tells a constant by its error, in units that nothing has normalised: where rewards are 0 but at the
+        goal, small rewards everywhere.
+        """
+        low, high = _held(_pair(self.rewards), _pair(own.rewards))
+        return Limits(_held(self.states, own.states), self.actions, (float(low[0]), float(high[0])))
+
     def clip_states(self, states: FloatMatrix, layout: Layout) -> FloatMatrix:
         """Return (n, width) states with their real-valued columns clipped."""
         return _clip(states, self.states, layout)
@@ -84,6 +94,16 @@ class Limits:
         states, actions = np.array(arrays[f"{prefix}.states"]), np.array(arrays[f"{prefix}.actions"])
         low, high = arrays[f"{prefix}.rewards"]
         return cls((states[0], states[1]), (actions[0], actions[1]), (float(low), float(high)))
+
+
+def _pair(bounds: tuple[float, float]) -> Bounds:
+    return np.array([bounds[0]]), np.array([bounds[1]])
+
+
+def _held(bounds: Bounds, own: Bounds) -> Bounds:
+    constant = own[1] - own[0] <= CONSTANT * np.maximum(np.abs(own[0]), np.abs(own[1]))
+    value = np.clip(own[0], *bounds)
+    return np.where(constant, value, bounds[0]), np.where(constant, value, bounds[1])
 
 
 def _widened(rows: npt.NDArray[np.floating[Any]], margin: float, bounds: Bounds | None) -> Bounds:

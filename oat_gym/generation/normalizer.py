@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from oat_gym.spaces import FloatMatrix, Layout
 
-_CONSTANT = 1e-10  # a column whose spread is below this share of its size is constant up to rounding
+CONSTANT = 1e-10
+"""A column whose spread is below this share of its size is constant up to rounding."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Normalizer:
         columns = list(layout.continuous)
         mean[columns] = rows[:, columns].mean(axis=0)
         spread = rows[:, columns].std(axis=0)
-        constant = spread <= _CONSTANT * np.abs(rows[:, columns]).max(axis=0)
+        constant = spread <= CONSTANT * np.abs(rows[:, columns]).max(axis=0)
         scale[columns] = np.where(constant, 1.0, spread)
         return cls(mean, scale)
 

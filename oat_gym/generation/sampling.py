@@ -109,7 +109,8 @@ class FittedVAEMDP:
             actions: (n, W, action width) recorded actions to replay instead; with a policy too, it only scores them.
             start: `"prior"`, z_1 ~ N(0, I) (the paper); or `"posterior"`, z_1 ~ q(z_1|s_1) of `start_states`.
             start_states: (n, state width), for `start="posterior"`.
-            limits: generated real values are clipped to these; by default to the training spans' widened range.
+            limits: generated real values are clipped to these; by default to the training spans' widened range. State
+                columns and rewards that are constant in the training spans stay so in either case.
             observation_noise: draw states, rewards and ends from their distributions (the paper); if false, take
                 means and most likely categories. Latent states and actions are drawn in either case.
             steps: roll out so many steps in place of W: the same as the first ones of a longer roll-out.
@@ -123,7 +124,11 @@ class FittedVAEMDP:
         self._check_arguments(count, steps, policy=policy, actions=actions, start=start, start_states=start_states)
         generator = torch_generator(rng)
         with one_thread(), torch.no_grad():
-            roll = _RollOut(self, generator if observation_noise else None, limits or self.limits)
+            roll = _RollOut(
+                self,
+                generator if observation_noise else None,
+                self.limits if limits is None else limits.holding(self.limits),
+            )
             z = self._start(count, generator, start_states)
             carry = self.network.first_carry(z)
             states, chosen, rewards, scores, ends, logits = [roll.state(z)], [], [], [], [], []

@@ -155,6 +155,24 @@ def test_values_stay_within_limits(kit, tiny_model):
     assert model.sample(300, rng=np.random.default_rng(0), policy=wild, limits=inner).actions.min() == -0.5
 
 
+@pytest.mark.parametrize("noise", [True, False])
+def test_what_is_constant_in_the_spans_stays_so_within_wider_limits(kit, noise):
+    s, a, r = kit.random_spans(np.random.default_rng(0))
+    s[..., 1], r[:] = 0.002, 0.0
+    layouts = {"state_layout": kit.real(3), "action_layout": kit.real(2)}
+    model = fit_vae_mdp(s, a, r, config=kit.tiny, rng=np.random.default_rng(1), **layouts)
+    free = np.array([[0.0, 0.0, 0.0], [20.0, 0.01, 20.0]])
+    limits = Limits.of(free, np.array([[-9.0] * 2, [9.0] * 2]), np.array([0.0, 1.0]), margin=0.1)
+    arguments = {"policy": kit.GaussianPolicy(width=2), "limits": limits, "observation_noise": noise}
+    samples = model.sample(50, rng=np.random.default_rng(0), **arguments)
+    assert (samples.states[..., 1] == 0.002).all()
+    assert (samples.rewards == 0).all()
+    assert np.ptp(samples.states[..., 0]) > 0
+    # a constant that the limits do not hold: the nearest value that they do
+    low = Limits(limits.states, limits.actions, (0.5, 1.0))
+    assert (model.sample(5, rng=np.random.default_rng(0), **arguments | {"limits": low}).rewards == 0.5).all()
+
+
 def test_recorded_actions_are_replayed(kit, tiny_model):
     model, (_, actions, _) = tiny_model
     samples = model.sample(12, rng=np.random.default_rng(0), actions=actions)
