@@ -71,8 +71,11 @@ def stitch_into(episode: EpisodeData, span: Span, replacement: Replacement) -> N
     width = span.stop - span.start
     if not 0 <= span.start < span.stop <= len(episode.rewards):
         raise ConfigurationError(f"The span {span.start}:{span.stop} is not inside 0:{len(episode.rewards)}.")
-    if len(replacement.rewards) != width or tree_length(replacement.observations) != width + 1:
-        raise ConfigurationError(f"A span of {width} steps takes {width} rewards, got {len(replacement.rewards)}.")
+    parts = {"observations": width + 1, "actions": width, "rewards": width}
+    for name, expected in parts.items():
+        length = tree_length(getattr(replacement, name))
+        if length != expected:
+            raise ConfigurationError(f"A span of {width} steps takes {expected} {name}, got {length}.")
     rows = slice(span.start, span.stop)
 
     def put(target: Any, values: Any) -> None:

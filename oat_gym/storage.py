@@ -28,7 +28,7 @@ from minari.dataset.minari_storage import METADATA_FILE_NAME, MinariStorage
 
 from oat_gym._live import LIVE, attach
 from oat_gym._staging import owned_folder
-from oat_gym.augmenters.base import Variation
+from oat_gym.augmenters.base import Variation, inherited_next_states
 from oat_gym.cache import write_atomically
 from oat_gym.episodes import check_episode, copy_episode
 from oat_gym.errors import InvalidDataError, SaveError, SourceChangedError
@@ -199,8 +199,10 @@ class AugmentedStorage(MinariStorage):
             source = self._plan().source
             inner = source.dataset.storage
             return inner.next_states(int(source.ids[number])) if isinstance(inner, AugmentedStorage) else {}
-        made = variation or self.variation(number)
-        return {} if made is None else made.next_states
+        if (made := variation or self.variation(number)) is None:
+            return {}
+        i = (number - self.n_real) % self.n_real
+        return inherited_next_states(self.next_states(i), int(self._plan().lengths[i]), made)
 
     def get_episode_metadata(self, episode_indices: Iterable[int]) -> Iterator[dict[str, Any]]:
         """Yield the source's metadata of each episode with its provenance (see `Provenance.to_metadata`)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
@@ -14,7 +15,7 @@ from oat_gym._rng import check_seed
 from oat_gym.augmenters.base import Augmenter, Sampler, Variation
 from oat_gym.cache import CacheEntry, canonical, fingerprint
 from oat_gym.episodes import IntArray
-from oat_gym.errors import ConfigurationError
+from oat_gym.errors import AugmentationWarning, ConfigurationError
 from oat_gym.progress import ProgressCallback, progress_bar
 from oat_gym.source import Source
 from oat_gym.spaces import iter_leaf_spaces
@@ -104,7 +105,7 @@ class Synthesis:
             self._material = [
                 sampler.decode(sampler.generate(k)) for k in _told("Generating variations", variations, progress)
             ]
-            self._sampler = sampler
+            self._use(sampler)
             return
         entry = CacheEntry(self.cache_key)
         with entry.lock():
@@ -118,6 +119,11 @@ class Synthesis:
                 self._variation_material(entry, sampler, k)
                 for k in _told("Generating variations", variations, progress)
             ]
+        self._use(sampler)
+
+    def _use(self, sampler: Sampler) -> None:
+        for note in sampler.notes:
+            warnings.warn(note, AugmentationWarning, stacklevel=2)
         self._sampler = sampler
 
     def _variation_material(self, entry: CacheEntry, sampler: Sampler, k: int) -> Any:

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from minari import EpisodeData
@@ -73,3 +75,13 @@ def test_the_literal_seam_keeps_both_tuples_own_next_states() -> None:
 def test_a_span_that_does_not_fit_is_an_error(span: Span, width: int) -> None:
     with pytest.raises(ConfigurationError, match="span"):
         stitch(coded(6), span, generated(width))
+
+
+@pytest.mark.parametrize("steps", [1, 3, 5])
+@pytest.mark.parametrize("part", ["observations", "actions", "rewards"])
+def test_a_part_of_another_length_is_named_with_its_length(part: str, steps: int) -> None:
+    right, other = generated(4 if part != "observations" else 6), generated(steps)
+    wrong = dataclasses.replace(right, **{part: getattr(other, part)})
+    expected, got = (7, steps + 1) if part == "observations" else (4, steps)
+    with pytest.raises(ConfigurationError, match=f"takes {expected} {part}, got {got}"):
+        stitch(coded(9), Span(1, expected - (part == "observations") + 1), wrong)

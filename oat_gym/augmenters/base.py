@@ -17,7 +17,7 @@ from oat_gym.mining import MiningResult
 from oat_gym.progress import ProgressCallback, silent
 from oat_gym.source import Source
 from oat_gym.spaces import Batch
-from oat_gym.stitching import Span
+from oat_gym.stitching import Span, spans_mask
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,17 @@ class Variation:
     log_prob: npt.NDArray[np.float64] | None = None
 
 
+def inherited_next_states(earlier: Mapping[int, Batch], steps: int, later: Variation) -> dict[int, Batch]:
+    """Return the next states of a variation: its own, and where it changed nothing those of what it was made from.
+
+    `earlier` are the next states of that episode, which has `steps` steps.
+    """
+    length = len(later.episode.rewards)
+    changed = spans_mask(later.spans, length)
+    kept = {t: row for t, row in earlier.items() if steps == length and not changed[t]}
+    return later.next_states | kept
+
+
 class Sampler(ABC):
     """A fitted augmenter: variation k of source episode i, as a pure function of (seed, i, k).
 
@@ -51,6 +62,11 @@ class Sampler(ABC):
     def mining(self) -> MiningResult | None:
         """What was mined, for methods that mine."""
         return None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What users are warned of when the sampler is put to use; nothing by default."""
+        return ()
 
     def generate(self, k: int) -> Arrays:
         """Return the generated arrays of variation `k`; none by default (everything is made by `variation`)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -19,15 +20,14 @@ from oat_gym.augmenters._parts import (
     with_prefix,
     zero_strengths,
 )
-from oat_gym.augmenters.base import Augmenter, Sampler, Variation
+from oat_gym.augmenters.base import Augmenter, Sampler, Variation, inherited_next_states
 from oat_gym.cache import Arrays, canonical
 from oat_gym.episodes import IntArray
-from oat_gym.errors import ConfigurationError
+from oat_gym.errors import AugmentationWarning, ConfigurationError
 from oat_gym.mining import MiningResult
 from oat_gym.progress import ProgressCallback, silent
 from oat_gym.provenance import merge_spans
 from oat_gym.source import DerivedSource, Source
-from oat_gym.stitching import spans_mask
 
 
 @dataclass(frozen=True)
@@ -148,6 +148,11 @@ class ComposeSampler(Sampler):
         """What the first augmenter mined."""
         return self._first.mining
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Those of the first sampler; the others are fitted to every variation, and warn when it is first read."""
+        return self._first.notes
+
     def state(self) -> tuple[Arrays, Any]:
         """Return the state of the first sampler; what the others learn from variation k is in `generate(k)`."""
         return self._first.state()
@@ -177,6 +182,8 @@ class ComposeSampler(Sampler):
             sampler = first or _fitted(part, source, seed, prefix, arrays, stored=stored)
             if not stored:
                 arrays |= with_prefix(f"{prefix}made/", sampler.generate(k))
+            for note in sampler.notes if stored and first is None else ():  # those of the first are `notes`
+                warnings.warn(note, AugmentationWarning, stacklevel=2)
             chain.links.append((sampler, sampler.decode(under_prefix(f"{prefix}made/", arrays))))
             if number + 1 < len(self._config.augmenters):
                 lengths = _lengths_of_all(part, source, k, seed)
@@ -218,11 +225,9 @@ class _Material:
 
 def put_over(earlier: Variation, later: Variation) -> Variation:
     """Return `later`, which was made from `earlier`, with what still holds of the spans and next states of that."""
-    length = len(later.episode.rewards)
-    changed = spans_mask(later.spans, length)
-    same_steps = len(earlier.episode.rewards) == length
-    kept = {t: row for t, row in earlier.next_states.items() if same_steps and not changed[t]}
-    return Variation(later.episode, merge_spans(earlier.spans, later.spans, length=length), later.next_states | kept)
+    spans = merge_spans(earlier.spans, later.spans, length=len(later.episode.rewards))
+    next_states = inherited_next_states(earlier.next_states, len(earlier.episode.rewards), later)
+    return Variation(later.episode, spans, next_states)
 
 
 def _fitted(part: Augmenter, source: Source, seed: int, prefix: str, arrays: Arrays, *, stored: bool) -> Sampler:

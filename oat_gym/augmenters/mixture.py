@@ -158,6 +158,11 @@ class MixtureSampler(Sampler):
         """What the first sampler that mines has mined."""
         return next((sampler.mining for sampler in self._samplers if sampler.mining is not None), None)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Those of all samplers."""
+        return tuple(note for sampler in self._samplers for note in sampler.notes)
+
     def state(self) -> tuple[Arrays, Any]:
         """Return the states of all samplers, the arrays under the number of each."""
         states = [sampler.state() for sampler in self._samplers]

@@ -76,7 +76,7 @@ class OAT(StitchingAugmenter):
         super().check(source)
         _feature_columns(self, source)
         if isinstance(self.mining.length, int):
-            advice = "Use OAT(mining=MiningConfig(length={half})) or length='auto'."
+            advice = "Use length={half} in OAT(mining=MiningConfig(...)), or length='auto'."
             check_length(source.lengths, self.mining.length, advice=advice)
 
     def fit(self, source: Source, *, seed: int, progress: ProgressCallback = silent) -> OATSampler:
@@ -87,8 +87,6 @@ class OAT(StitchingAugmenter):
             raise InvalidDataError(
                 f"No window reaches the support asked for, so there is nothing to augment.\n{mining!r}"
             )
-        if not self.cacheable:  # else `restore` follows, and warns
-            _warn_of_copies(mining, len(source))
         sequences = _windows(mining).sequences(data)
         learned = learn(self, source, data, sequences, seed=seed, progress=progress)
         return OATSampler(self, source, seed, mining=mining, learned=learned)
@@ -112,9 +110,8 @@ class OAT(StitchingAugmenter):
         return mine_once(series, config=self.mining, times=times, usable=usable, seed=seed, progress=progress)
 
     def restore(self, source: Source, arrays: Arrays, value: Any, *, seed: int) -> OATSampler:
-        """Return the sampler that `OATSampler.state` described; warns of episodes that it can only copy."""
+        """Return the sampler that `OATSampler.state` described."""
         mining = mining_from_state(with_prefix(arrays, "mining/"), value["mining"])
-        _warn_of_copies(mining, len(source))
         learned = Learned.from_arrays(arrays, config=self, names=_windows(mining).names)
         return OATSampler(self, source, seed, mining=mining, learned=learned)
 
@@ -131,6 +128,16 @@ class OATSampler(StitchedSampler):
         """Labels, supports and PST sets."""
         return self._mining
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Of episodes that can only be copied."""
+        few = f"(W={self._mining.length}; {self._mining.n_too_short} episodes have too few steps)"
+        return self.windows.notes(
+            len(self._source),
+            reason=f"hold no window of the PST sets {few}",
+            advice="More sets (top), fewer clusters or a smaller length reach more episodes.",
+        )
+
     def state(self) -> tuple[Arrays, Any]:
         """Return all that was mined and learnt, as arrays and JSON."""
         arrays, value = mining_to_state(self._mining)
@@ -141,14 +148,6 @@ class OATSampler(StitchedSampler):
 def _windows(mining: MiningResult) -> Windows:
     names = tuple(f"PST set {g}" for g in range(len(mining.sets)))
     return Windows(mining.length, tuple(pst.occurrences for pst in mining.sets), names)
-
-
-def _warn_of_copies(mining: MiningResult, n_source: int) -> None:
-    _windows(mining).warn_of_copies(
-        n_source,
-        reason=f"hold no window of the PST sets (W={mining.length}; {mining.n_too_short} episodes have too few steps)",
-        advice="More sets (top), fewer clusters or a smaller length reach more episodes.",
-    )
 
 
 def _feature_columns(config: OAT, source: Source) -> npt.NDArray[np.int64]:

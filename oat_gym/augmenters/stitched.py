@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, Self, get_args
@@ -26,11 +25,11 @@ from oat_gym.augmenters.generative import (
 from oat_gym.augmenters.spans import Occurrence, Placement, SpanSamples, place_spans, seam_jumps
 from oat_gym.cache import Arrays
 from oat_gym.episodes import IntArray
-from oat_gym.errors import AugmentationWarning, ShortEpisodesError
+from oat_gym.errors import ShortEpisodesError
 from oat_gym.generation import Sequences, VAEMDPConfig
 from oat_gym.generation.config import check_integer
 from oat_gym.source import Source
-from oat_gym.spaces import Batch, map_tree
+from oat_gym.spaces import Batch, map_tree, slice_tree
 from oat_gym.stitching import Seam, Span, literal_next_states, stitch_into, stitchable_copy
 
 FloatArray = npt.NDArray[np.float64]
@@ -123,16 +122,11 @@ class Windows:
         """Return where variation `k` of each of `n_source` episodes gets which set; spans never overlap."""
         return [place_spans(self.sets, i, k, self.length) for i in range(n_source)]
 
-    def warn_of_copies(self, n_source: int, *, reason: str, advice: str) -> None:
-        """Warn with an `AugmentationWarning` of episodes that hold no window, if there are any."""
+    def notes(self, n_source: int, *, reason: str, advice: str) -> tuple[str, ...]:
+        """Return what to say of episodes that hold no window, if there are any."""
         without = n_source - len(np.unique(np.concatenate([rows[:, 0] for rows in self.sets])))
-        if without:
-            warnings.warn(
-                f"{without} of {n_source} episodes {reason}: their synthetic episodes are exact copies of them. "
-                f"{advice}",
-                AugmentationWarning,
-                stacklevel=3,
-            )
+        copies = "their synthetic episodes are exact copies of them"
+        return (f"{without} of {n_source} episodes {reason}: {copies}. {advice}",) if without else ()
 
 
 def check_length(lengths: IntArray, length: int, *, advice: str) -> None:
@@ -239,6 +233,9 @@ class StitchedSampler(GenerativeSampler):
             if i not in samples.row_of:
                 continue
             span, replacement = samples.replacement(i, pst_set=g, number=k * len(self._source) + i)
+            if self._config.actions == "recorded":  # as they are, beyond the space's bounds too
+                taken = slice_tree(original.actions, slice(span.start, span.stop))
+                replacement = dataclasses.replace(replacement, actions=taken)
             stitch_into(episode, span, replacement)
             log_prob[span.start : span.stop] = samples.log_prob[samples.row_of[i]]
             spans.append(span)

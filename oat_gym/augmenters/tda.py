@@ -63,18 +63,21 @@ class TDA(StitchingAugmenter):
     def fit(self, source: Source, *, seed: int, progress: ProgressCallback = silent) -> StitchedSampler:
         """Draw the windows, clone the behaviour policy, and train one VAE-MDP on all windows."""
         data, windows = Matrices.of(source), self.windows(source, seed=seed)
-        if not self.cacheable:  # else `restore` follows, and warns
-            self._warn_of_copies(windows, source)
         learned = learn(self, source, data, windows.sequences(data), seed=seed, progress=progress)
-        return StitchedSampler(self, source, seed, windows=windows, learned=learned)
+        return TDASampler(self, source, seed, windows=windows, learned=learned)
 
     def restore(self, source: Source, arrays: Arrays, value: Any, *, seed: int) -> StitchedSampler:
-        """Return the sampler that `StitchedSampler.state` described; warns of episodes that it can only copy."""
+        """Return the sampler that `StitchedSampler.state` described."""
         windows = self.windows(source, seed=seed)
-        self._warn_of_copies(windows, source)
         learned = Learned.from_arrays(arrays, config=self, names=windows.names)
-        return StitchedSampler(self, source, seed, windows=windows, learned=learned)
+        return TDASampler(self, source, seed, windows=windows, learned=learned)
 
-    def _warn_of_copies(self, windows: Windows, source: Source) -> None:
-        reason = f"have no window of W={self.length} steps that may be replaced"
-        windows.warn_of_copies(len(source), reason=reason, advice="A smaller length reaches more episodes.")
+
+class TDASampler(StitchedSampler):
+    """A fitted TDA."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Of episodes that can only be copied."""
+        reason = f"have no window of W={self.windows.length} steps that may be replaced"
+        return self.windows.notes(len(self._source), reason=reason, advice="A smaller length reaches more episodes.")

@@ -41,6 +41,10 @@ def gaussian_kl(q: Gaussian, p: Gaussian) -> Tensor:
     return 0.5 * (ratio + distance - 1 - ratio.log()).sum(-1)
 
 
+_FAR_TAIL = -1e6
+"""Standard deviations below which log_ndtr has no gradient in float32: what bounds of 1e18, meant as none, lead to."""
+
+
 def censored_log_prob(gaussian: Gaussian, x: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Return the log-likelihood of each entry of a Gaussian variable that is clipped to [low, high].
 
@@ -49,8 +53,8 @@ def censored_log_prob(gaussian: Gaussian, x: Tensor, low: Tensor, high: Tensor) 
     """
     # Tails of infinite bounds are never selected, but their gradients must be finite all the same.
     safe_low, safe_high = torch.nan_to_num(low, neginf=0.0), torch.nan_to_num(high, posinf=0.0)
-    below = torch.special.log_ndtr((safe_low - gaussian.mean) / gaussian.scale)
-    above = torch.special.log_ndtr((gaussian.mean - safe_high) / gaussian.scale)
+    below = torch.special.log_ndtr(((safe_low - gaussian.mean) / gaussian.scale).clamp(min=_FAR_TAIL))
+    above = torch.special.log_ndtr(((gaussian.mean - safe_high) / gaussian.scale).clamp(min=_FAR_TAIL))
     inside = gaussian_log_prob(gaussian, x)
     return torch.where(x <= low, below, torch.where(x >= high, above, inside))
 

@@ -7,14 +7,17 @@ from types import SimpleNamespace
 import minari
 import numpy as np
 import pytest
+from gymnasium import spaces
 from scipy import stats
 
-from oat_gym import OAT, TDA, AugmentedDataset
+from oat_gym import OAT, TDA, AugmentedDataset, Compose, Function, Jittering, Mixture, Permutation
 from oat_gym.episodes import content_hash
 from oat_gym.errors import AugmentationWarning, ConfigurationError, InvalidDataError
 from oat_gym.generation import BehaviorConfig, VAEMDPConfig
 from oat_gym.mining.pst import PSTSet
 from oat_gym.source import Source
+from oat_gym.stitching import spans_mask
+from tests.conftest import install_dataset, walks
 
 QUICK = {"model": VAEMDPConfig(max_updates=20), "behavior": BehaviorConfig(max_updates=50)}
 
@@ -107,6 +110,45 @@ def test_episodes_without_a_window_are_copied_and_it_says_so(
     log_prob = data.synthesis.variation(1).log_prob
     assert log_prob is not None
     assert np.isnan(log_prob).all()
+
+
+def test_copies_are_told_of_where_a_function_of_the_user_is_a_part(
+    make_dataset: Callable[..., minari.MinariDataset],
+) -> None:
+    tda, same = TDA(length=5, **QUICK), Function(lambda episode, rng: episode)
+    real = make_dataset([9, 4, 1, 7])
+    for method in (Mixture((tda, same)), Compose((tda, same)), Compose((same, tda)), Mixture((tda, Jittering()))):
+        with pytest.warns(AugmentationWarning, match="2 of 4 episodes have no window of W=5") as caught:
+            list(AugmentedDataset(real, method, factor=2))
+        assert len([warning for warning in caught if "no window" in str(warning.message)]) == 1, method
+
+
+def test_next_states_of_a_source_stay_in_the_steps_that_are_copied(
+    make_dataset: Callable[..., minari.MinariDataset],
+) -> None:
+    source = AugmentedDataset(make_dataset([30] * 12), Permutation(), factor=2)
+    data = AugmentedDataset(source, TDA(length=4, **QUICK), factor=2)
+    kept = 0
+    for number in range(12, 24):
+        own, new = source.storage.next_states(number), data.storage.next_states(24 + number)
+        generated = data.storage.variation(24 + number)
+        assert generated is not None
+        changed = spans_mask(generated.spans, 30)
+        for t, row in own.items():
+            assert (t in new) is not changed[t]
+            if t in new:
+                np.testing.assert_array_equal(new[t]["position"], row["position"])
+                kept += 1
+    assert kept > 5
+
+
+def test_recorded_actions_are_replayed_as_they_are_beyond_the_bounds_of_the_space() -> None:
+    real = install_dataset("test/wild-v0", walks(8, 24), spaces.Box(-100, 100, (2,)), spaces.Box(-0.1, 0.1, (2,)))
+    data = AugmentedDataset(real, TDA(length=6, actions="recorded", **QUICK), factor=2)
+    assert any(np.abs(episode.actions).max() > 0.1 for episode in real)
+    for number in range(8):
+        np.testing.assert_array_equal(data[8 + number].actions, real[number].actions)
+        assert data.provenance(8 + number).mask.any()
 
 
 def test_episodes_that_are_all_too_short_get_a_clear_answer_at_once(

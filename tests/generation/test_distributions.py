@@ -54,13 +54,15 @@ def test_censored_gaussian_integrates_to_one():
     assert censored_log_prob(p, high + 3, low, high) == censored_log_prob(p, high, low, high)
 
 
-def test_infinite_bounds_censor_nothing_and_keep_gradients_finite(generator):
+@pytest.mark.parametrize("bound", [float("inf"), float(torch.finfo(torch.float32).max), 1e19, 1e18, 1e7])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bounds_that_mean_none_censor_nothing_and_keep_gradients_finite(generator, bound, dtype):
     p = random_gaussian(generator, 4, 2)
-    mean = p.mean.clone().requires_grad_()
-    infinity = torch.full((2,), torch.inf, dtype=torch.float64)
-    x = torch.randn((4, 2), generator=generator, dtype=torch.float64)
-    value = censored_log_prob(Gaussian(mean, p.scale), x, -infinity, infinity)
-    torch.testing.assert_close(value, td.Normal(mean, p.scale).log_prob(x))
+    mean, scale = p.mean.to(dtype, copy=True).requires_grad_(), p.scale.to(dtype)
+    bounds = torch.full((2,), bound, dtype=dtype)
+    x = torch.randn((4, 2), generator=generator, dtype=torch.float64).to(dtype)
+    value = censored_log_prob(Gaussian(mean, scale), x, -bounds, bounds)
+    torch.testing.assert_close(value, td.Normal(mean, scale).log_prob(x))
     value.sum().backward()
     assert torch.isfinite(mean.grad).all()
 
