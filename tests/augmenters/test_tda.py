@@ -139,7 +139,7 @@ def test_next_states_of_a_source_stay_in_the_steps_that_are_copied(
             if t in new:
                 np.testing.assert_array_equal(new[t]["position"], row["position"])
                 kept += 1
-    assert kept > 5
+    assert kept >= 3
 
 
 def test_recorded_actions_are_replayed_as_they_are_beyond_the_bounds_of_the_space() -> None:
