@@ -113,7 +113,7 @@ def windows(
     names: Sequence[str],
     path: Path | None = None,
 ) -> Figure:
-    """Return the course of each feature in mined windows: mean and quartiles at each step, and the mean of all data.
+    """Return the course of each feature in mined windows: median and quartiles by step, and the median of all data.
 
     Args:
         values: (M, W, D) the windows.
@@ -190,5 +190,6 @@ def _finish(figure: Figure, path: Path | None, *, legend: Axes | None = None) ->
         handles, labels = legend.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=_TEXT, frameon=False)
     if path is not None:
-        figure.savefig(path, dpi=_DPI, metadata={"Software": None})
+        is_png = os.path.splitext(path)[1].lower() in ("", ".png")  # noqa: PTH122  (bytes of a path too)
+        figure.savefig(path, dpi=_DPI, metadata={"Software": None} if is_png else None)
     return figure

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import minari
 import numpy as np
@@ -20,7 +20,7 @@ from oat_gym.domains.sepsis_belief import believed_values, current_values, last_
 from oat_gym.domains.sepsis_stages import PENALTIES, STAGES, pressure_shock, rewards, stages
 from oat_gym.domains.sepsis_tables import Tables, find_tables
 from oat_gym.domains.sepsis_visits import Visit, read_visits
-from oat_gym.errors import InvalidDataError
+from oat_gym.errors import ConfigurationError, InvalidDataError
 from oat_gym.io.writing import DatasetCard, dataset_from_episodes, episode_buffer
 
 logger = logging.getLogger(__name__)
@@ -36,6 +36,7 @@ OBSERVATION_SPACE = spaces.Dict(
 )
 """`values`: the 15 attributes in their units, imputed between measurements; `recorded`: 1 where one was measured."""
 ACTION_SPACE = spaces.Discrete(len(ACTIONS))
+Part = Literal["all", "train", "test"]
 VERSION = 1
 """Of the conversion: raised when it changes."""
 
@@ -48,9 +49,7 @@ _DESCRIPTION = (
 )
 
 
-def sepsis_clif(
-    path: str | os.PathLike[str] | None = None, *, part: Literal["all", "train", "test"] = "all"
-) -> minari.MinariDataset:
+def sepsis_clif(path: str | os.PathLike[str] | None = None, *, part: Part = "all") -> minari.MinariDataset:
     """Return the visits with suspected infection of CLIF tables (`sepsis_visits` says which), an episode a visit.
 
     Without `path` it is MIMIC-IV's open demo: 83 visits of 70 patients, 21,595 events. A visit of N events gives
@@ -67,9 +66,11 @@ def sepsis_clif(
 
     Raises:
         DatasetNotFoundError: if the data is not there; the message says how to get it.
-        ConfigurationError: without pyarrow (`pip install oat-gym[sepsis]`).
+        ConfigurationError: without pyarrow (`pip install oat-gym[sepsis]`), or for another part.
         InvalidDataError: if the tables are not as CLIF defines them.
     """
+    if part not in get_args(Part):
+        raise ConfigurationError(f"part must be one of {', '.join(get_args(Part))}; got {part!r}.")
     dataset = convert(find_tables(path))
     return dataset if part == "all" else train_test(dataset)[part == "test"]
 

@@ -138,6 +138,35 @@ def digest(identifier: str) -> str:
     return hashlib.sha256(f"oat_gym sepsis {identifier}".encode()).hexdigest()[:12]
 
 
+def check_clocks(tables: Tables) -> None:
+    """Raise `InvalidDataError` where some time columns have a time zone and others have none: they cannot be compared.
+
+    Raises `ConfigurationError` without pyarrow.
+    """
+    schemas = {name: _schema(tables.file(name)) for name in TABLES}
+    zones = {
+        f"clif_{name}.{column}": schema.field(column).type.tz
+        for name, schema in schemas.items()
+        for column, kind in TABLES[name].items()
+        if kind == "time" and column in schema.names and _is(schema.field(column).type, kind)
+    }
+    without = [column for column, zone in zones.items() if zone is None]
+    if without and len(without) < len(zones):
+        others = next(column for column, zone in zones.items() if zone is not None)
+        raise InvalidDataError(
+            f"{tables.folder}: {', '.join(without)} have no time zone and others, such as {others}, have one; write "
+            "all times in UTC, as CLIF defines them."
+        )
+
+
+def _schema(file: Path) -> Any:
+    try:
+        import pyarrow.parquet as pq  # noqa: PLC0415
+    except ImportError as error:
+        raise ConfigurationError("CLIF tables are read with pyarrow: pip install oat-gym[sepsis]") from error
+    return pq.read_schema(file)
+
+
 def read_table(tables: Tables, name: str, *, visits: Sequence[str] | None = None) -> Columns:
     """Return the columns of `TABLES[name]`, of the rows of some visits: texts, float64 numbers and datetime64[us].
 
@@ -147,12 +176,8 @@ def read_table(tables: Tables, name: str, *, visits: Sequence[str] | None = None
         ConfigurationError: without pyarrow.
         InvalidDataError: if the table or a column is missing, or a column has another type.
     """
-    try:
-        import pyarrow.parquet as pq  # noqa: PLC0415
-    except ImportError as error:
-        raise ConfigurationError("CLIF tables are read with pyarrow: pip install oat-gym[sepsis]") from error
     file, wanted = tables.file(name), TABLES[name]
-    schema: Any = pq.read_schema(file)
+    schema = _schema(file)
     missing = [column for column in wanted if column not in schema.names]
     if missing:
         raise InvalidDataError(f"{file} lacks the columns {missing} of CLIF's table {name}; it has {schema.names}.")
@@ -163,6 +188,8 @@ def read_table(tables: Tables, name: str, *, visits: Sequence[str] | None = None
                 "as CLIF defines it."
             )
     chosen = None if visits is None else [("hospitalization_id", "in", list(visits))]
+    import pyarrow.parquet as pq  # noqa: PLC0415
+
     table: Any = pq.read_table(file, columns=list(wanted), filters=chosen)
     return {column: _to_numpy(table[column], kind) for column, kind in wanted.items()}
 

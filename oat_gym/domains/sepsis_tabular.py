@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import minari
 import numpy as np
@@ -40,7 +40,7 @@ from oat_gym.domains._tabular import (
 )
 from oat_gym.domains.task import Task
 from oat_gym.domains.truth import Truth, exact_truth
-from oat_gym.errors import DatasetNotFoundError, InvalidDataError
+from oat_gym.errors import ConfigurationError, DatasetNotFoundError, InvalidDataError
 from oat_gym.io.writing import DatasetCard, dataset_from_episodes
 from oat_gym.ope.policies import draw
 from oat_gym.ope.policy import Policy
@@ -110,9 +110,12 @@ def sepsis_model(name: Model, path: str | os.PathLike[str] | None = None) -> Sep
         path: the .npz file, or a folder that holds it; `None`: the data folder, or an installed `icu-sepsis`.
 
     Raises:
+        ConfigurationError: for another name.
         DatasetNotFoundError: if the file is not there; the message says how to get it.
         InvalidDataError: if it does not hold what is expected.
     """
+    if name not in get_args(Model):
+        raise ConfigurationError(f"The tabular models are {', '.join(get_args(Model))}; got {name!r}.")
     source = _source(name, path)
     return _read(name, source, source.stat().st_mtime_ns)
 

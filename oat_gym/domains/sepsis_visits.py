@@ -20,7 +20,7 @@ from oat_gym.domains.sepsis_attributes import (
     VITALS,
     Attribute,
 )
-from oat_gym.domains.sepsis_tables import Columns, Tables, digest, is_open, read_table
+from oat_gym.domains.sepsis_tables import Columns, Tables, check_clocks, digest, is_open, read_table
 from oat_gym.errors import InvalidDataError
 
 logger = logging.getLogger(__name__)
@@ -95,8 +95,10 @@ def read_visits(tables: Tables) -> list[Visit]:
         ConfigurationError: without pyarrow.
         InvalidDataError: for missing tables, columns and units, and if no visit has such an antibiotic.
     """
+    check_clocks(tables)
     doses = read_table(tables, "medication_admin_intermittent")
     given = (doses["med_group"] == ANTIBIOTICS) & ~np.isin(doses["mar_action_category"], NO_DOSE)
+    given &= ~np.isnat(doses["admin_dttm"])  # nobody knows when, so that it is no event
     ids = np.unique(doses["hospitalization_id"][given])
     if tables.open_only:
         ids = ids[is_open(ids)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import metadata
 from pathlib import Path
 from types import MappingProxyType
@@ -58,6 +58,11 @@ class Truth:
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
         if not set(self.values) == set(self.standard_errors) == set(self.standard_deviations):
             raise InvalidDataError("A Truth has a value, a standard error and a standard deviation for each policy.")
+
+    def __reduce__(self) -> tuple[type[Truth], tuple[Any, ...]]:
+        """Return plain parts: views of mappings can be neither pickled nor copied."""
+        parts = (getattr(self, each.name) for each in fields(self))
+        return Truth, tuple(dict(part) if isinstance(part, Mapping) else part for part in parts)
 
 
 def discounted_returns(rewards: FloatArray, gamma: float) -> FloatArray:

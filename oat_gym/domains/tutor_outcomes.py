@@ -87,10 +87,16 @@ def outcomes(path: str | os.PathLike[str] | None = None) -> dict[str, Outcome]:
     source = find_file(FILE, path=path, how_to_get=HOW_TO_GET)
     with source.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
+    if any(None in row.values() for row in rows):
+        raise InvalidDataError(f"{source} has a row that lacks columns, as in a file that was cut. {HOW_TO_GET}")
     try:
-        return {name: _group([row for row in rows if row["Condition"] == code]) for name, code in CONDITIONS.items()}
+        found = {name: _group([row for row in rows if row["Condition"] == code]) for name, code in CONDITIONS.items()}
     except (KeyError, ValueError) as error:
         raise InvalidDataError(f"{source} is not the table of outcomes ({error}). {HOW_TO_GET}") from error
+    empty = [name for name, group in found.items() if not len(group)]
+    if empty:
+        raise InvalidDataError(f"{source} holds no student of the condition {empty[0]!r}. {HOW_TO_GET}")
+    return found
 
 
 def mean_and_error(values: FloatArray) -> tuple[float, float]:

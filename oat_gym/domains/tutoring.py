@@ -132,10 +132,16 @@ def _read_log(source: Path) -> dict[str, npt.NDArray[Any]]:
         rows = list(reader)
     try:
         table = {name: np.array([float(row[name]) for row in rows]) for name in names}
-    except ValueError as error:
+    except (TypeError, ValueError) as error:  # a row that was cut has None
         raise InvalidDataError(f"{source} holds a value that is not a number: {error}.") from error
-    whole = {name: table[name].astype(np.int64) for name in ("user_id", "action_number", "action")}
+    whole = {name: _whole(table[name], name, source) for name in ("user_id", "action_number", "action")}
     return {**table, **whole, "propensity": _taken_probability(table, source)}
+
+
+def _whole(values: npt.NDArray[np.float64], name: str, source: Path) -> npt.NDArray[np.int64]:
+    if not (np.isfinite(values) & (values == np.round(values))).all():
+        raise InvalidDataError(f"{source}: the column {name} must hold whole numbers only. {_HOW_TO_GET}")
+    return values.astype(np.int64)
 
 
 def _taken_probability(table: dict[str, npt.NDArray[np.float64]], source: Path) -> npt.NDArray[np.float64]:
@@ -143,6 +149,8 @@ def _taken_probability(table: dict[str, npt.NDArray[np.float64]], source: Path) 
     if not np.isin(action, np.arange(len(ACTIONS))).all():
         raise InvalidDataError(f"{source} has actions {np.unique(action).tolist()}; expected 0 to {len(ACTIONS) - 1}.")
     probabilities = np.stack([table[f"p_{name}"] for name in ACTIONS], axis=1)
+    if not ((probabilities >= 0) & (probabilities <= 1)).all():
+        raise InvalidDataError(f"{source} has probabilities of actions outside 0 to 1. {_HOW_TO_GET}")
     taken = probabilities[np.arange(len(action)), action]
     return np.maximum(taken, PROBABILITY_FLOOR)
 

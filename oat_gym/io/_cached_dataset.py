@@ -57,6 +57,7 @@ def _is_intact(entry: CacheEntry, folder: Path) -> bool:
 
 
 def _make(entry: CacheEntry, folder: Path, write: Callable[[Path], None]) -> None:
+    entry.path.mkdir(parents=True, exist_ok=True)  # who cleared the cache held the lock until now
     for leftover in entry.path.glob(f"{_STAGING}*"):  # of a killed process: this one holds the lock
         shutil.rmtree(leftover)
     staging = Path(tempfile.mkdtemp(prefix=_STAGING, dir=entry.path))

@@ -6,6 +6,7 @@ depends on how the episode ended. See `episodes_from_table`; `oat_gym.io.writing
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Sequence
 from typing import Any, Protocol
@@ -124,13 +125,24 @@ def _step_columns(table: Table, observations: Columns, action: Columns, reward: 
 
 def _ends(table: Table, terminated: bool | str, rows: int) -> npt.NDArray[np.bool_]:
     if isinstance(terminated, str):
-        return _numbers(table, terminated).astype(bool)
+        return _flags(table, terminated)
     if not isinstance(terminated, bool | np.bool_):
         raise ConfigurationError(
             f"terminated must be True, False or the name of a column, got a {type(terminated).__name__}: give False "
             "where the log stops before the episodes end, and a column where only some of them terminated."
         )
     return np.full(rows, terminated)
+
+
+def _flags(table: Table, name: str) -> npt.NDArray[np.bool_]:
+    values = _numbers(table, name)
+    other = np.flatnonzero((values != 0) & (values != 1))
+    if len(other):
+        raise InvalidDataError(
+            f"Column {name!r} has {len(other)} values that are neither 0 nor 1, the first {values[other[0]]} in row "
+            f"{other[0]}; give 1 in the last row of episodes that terminated and 0 elsewhere, also of cut-off ones."
+        )
+    return values.astype(bool)
 
 
 def _info_columns(table: Table, infos: Sequence[str], propensity: str | None, time: str | None) -> dict[str, Array]:
@@ -165,7 +177,7 @@ def _column(table: Table, name: str) -> Array:
         raise ConfigurationError(f"The table has no column {name!r}; its columns are {names[:_NAMES_SHOWN]}{more}.")
     values = table[name]
     if getattr(getattr(values, "dtype", None), "tz", None) is not None:  # pandas would give objects; in UTC
-        array = values.to_numpy(dtype="datetime64[ns]")
+        array = values.to_numpy(dtype=f"datetime64[{values.dtype.unit}]")
     else:
         array = np.asarray(values.to_numpy() if hasattr(values, "to_numpy") else values)
     if array.ndim != 1:
@@ -209,15 +221,26 @@ def _ordinals(table: Table, name: str) -> Array:
 def _seconds(times: Array) -> Array:
     if times.dtype.kind != "M":
         return times
-    return times.astype("datetime64[ns]").astype(np.int64) / 1e9
+    epoch = np.zeros(1, dtype=times.dtype)  # in the column's own unit: nanoseconds end in 2262
+    return (times - epoch) / np.timedelta64(1, "s")
 
 
 def _identifiers(table: Table, name: str) -> Array:
     values = _column(table, name)
     if values.dtype.kind in "biuf":
         return _numbers(table, name)
-    _check_finite(name, np.array([isinstance(value, str) for value in values.tolist()], dtype=bool))
+    given = values.tolist()
+    _check_finite(name, np.array([not (value is None or _is_nan(value)) for value in given], dtype=bool))
+    kinds = sorted({type(value).__name__ for value in given} - {"str"})
+    if kinds:
+        raise InvalidDataError(
+            f"Column {name!r} holds {', '.join(kinds)} values; ids must be all numbers or all texts."
+        )
     return values.astype(str)
+
+
+def _is_nan(value: object) -> bool:
+    return isinstance(value, float) and math.isnan(value)
 
 
 def _matrix(table: Table, columns: Columns) -> Array:

@@ -315,6 +315,46 @@ def test_tables_of_another_layout_are_refused(tmp_path, table, change, message):
         sepsis_clif.sepsis_clif(folder)
 
 
+def test_times_with_and_without_a_time_zone_are_refused(tmp_path):
+    folder = three_visits().write(tmp_path)
+
+    def local(table):
+        place = table.column_names.index("recorded_dttm")
+        return table.set_column(place, "recorded_dttm", table["recorded_dttm"].cast(pa.timestamp("us")))
+
+    damaged(folder, "vitals", local)
+    with pytest.raises(InvalidDataError, match=r"clif_vitals.recorded_dttm have no time zone and others, such as clif"):
+        sepsis_clif.sepsis_clif(folder)
+    made = three_visits()
+    expected = [episode.rewards.tolist() for episode in opened(made, tmp_path / "zoned")]
+    folder = made.write(tmp_path / "plain")
+    for file in folder.glob("*.parquet"):
+        table = pq.read_table(file)
+        times = (pa.types.is_timestamp(each.type) for each in table.columns)
+        plain = [
+            each.cast(pa.timestamp("us")) if is_time else each
+            for each, is_time in zip(table.columns, times, strict=True)
+        ]
+        pq.write_table(pa.table(plain, names=table.column_names), file)
+    assert [episode.rewards.tolist() for episode in sepsis_clif.sepsis_clif(folder)] == expected
+
+
+def test_an_antibiotic_without_a_time_makes_no_visit(tmp_path):
+    made = three_visits()
+    expected = len(opened(made, tmp_path / "three"))
+    made.visit("v-d", "p-d", hour=None)
+    made.rows["medication_admin_intermittent"].append(
+        made.rows["medication_admin_intermittent"][0] | {"hospitalization_id": "v-d", "admin_dttm": None}
+    )
+    assert len(opened(made, tmp_path / "four")) == expected
+
+
+def test_an_unknown_part_is_refused(tmp_path):
+    folder = three_visits().write(tmp_path)
+    with pytest.raises(ConfigurationError, match="part must be one of all, train, test; got 'Test'"):
+        sepsis_clif.sepsis_clif(folder, part="Test")
+
+
 def test_a_missing_table_is_named(tmp_path):
     folder = three_visits().write(tmp_path)
     (folder / "clif_labs.parquet").unlink()

@@ -43,6 +43,13 @@ def test_the_curve_is_drawn_where_there_are_episodes():
     assert sorted(text.get_text() for text in axes.texts) == ["1", "1", "2", "2"]
 
 
+@pytest.mark.parametrize("ending", ["svg", "jpg", "pdf", "png"])
+def test_pictures_are_saved_in_every_format(tmp_path, ending):
+    path = tmp_path / f"windows.{ending}"
+    pictures.windows(np.zeros((3, 5, 2)), np.zeros((9, 2)), names=["a", "b"], path=str(path))
+    assert path.stat().st_size > 1000
+
+
 def test_windows_show_the_median_course():
     values = np.arange(5.0)[None, :, None] + np.array([0.0, 1.0, 10.0])[:, None, None]
     figure = pictures.windows(values, np.full((7, 1), 4.0), names=["heart_rate"])

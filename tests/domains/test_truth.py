@@ -1,6 +1,8 @@
 """Stored truths: written, read and refused; the moments against sums by hand."""
 
+import copy
 import json
+import pickle
 import sys
 
 import numpy as np
@@ -103,3 +105,11 @@ def test_exact_values_have_no_error():
     found = exact_truth({"a": 1.5}, gamma=0.9, horizon=None, command="solve")
     assert (found.values["a"], found.standard_errors["a"], found.episodes) == (1.5, 0.0, 0)
     assert np.isnan(found.standard_deviations["a"])
+
+
+def test_a_truth_goes_to_other_processes_and_is_copied():
+    truth = exact_truth({"a": 1.0, "b": 2.0}, gamma=0.9, horizon=5, command="by hand")
+    for other in (pickle.loads(pickle.dumps(truth)), copy.deepcopy(truth)):
+        assert repr(other) == repr(truth)
+        with pytest.raises(TypeError):
+            other.values["a"] = 3.0

@@ -92,6 +92,10 @@ def test_a_table_that_is_missing_or_another_is_refused(tmp_path):
         tutoring.outcomes(tmp_path / "other.csv")
     with pytest.raises(InvalidDataError, match="could not convert"):
         tutoring.outcomes(write_outcomes(tmp_path / "damaged.csv", [ROWS[0].replace("45.0", "x")]))
+    with pytest.raises(InvalidDataError, match="a row that lacks columns"):
+        tutoring.outcomes(write_outcomes(tmp_path / "cut.csv", [*ROWS[:-1], ROWS[-1][:8]]))
+    with pytest.raises(InvalidDataError, match="no student of the condition 'rl'"):
+        tutoring.outcomes(write_outcomes(tmp_path / "half.csv", ROWS[:1]))
 
 
 @pytest.mark.shared_data

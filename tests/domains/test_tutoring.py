@@ -92,6 +92,9 @@ def test_the_probability_of_the_action_taken_is_used(tmp_path):
         ([row(1, 5), row(1, 5)], "two rows with action_number=5"),
         ([row(1, 5, action=4)], r"has actions \[4\]; expected 0 to 3"),
         ([row(1, 5, reward="")], "not a number"),
+        ([row(1, 5, action=1.7)], "the column action must hold whole numbers only"),
+        ([row(float("nan"), 5, reward=0.0)], "the column user_id must hold whole numbers only"),
+        ([row(1, 5, p=(0.7, 7.0, 0.1, 0.1))], "probabilities of actions outside 0 to 1"),
         ([row(1, 5, pos_norm=2.0)], "are not all in Box"),
         ([row(1, 5, neg_norm="nan")], "'neg_norm' has 1 missing"),
     ],
@@ -99,6 +102,14 @@ def test_the_probability_of_the_action_taken_is_used(tmp_path):
 def test_a_damaged_log_is_refused(tmp_path, rows, message):
     write_log(tmp_path / "log.csv", rows)
     with pytest.raises(InvalidDataError, match=message):
+        tutoring.smartprimer(tmp_path / "log.csv")
+
+
+def test_a_log_that_was_cut_in_a_row_is_refused(tmp_path):
+    write_log(tmp_path / "log.csv", [row(1, 5), row(1, 6)])
+    whole = (tmp_path / "log.csv").read_text()
+    (tmp_path / "log.csv").write_text(whole[: len(whole.rstrip()) - 12])
+    with pytest.raises(InvalidDataError, match="not a number"):
         tutoring.smartprimer(tmp_path / "log.csv")
 
 

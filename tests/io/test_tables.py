@@ -132,6 +132,38 @@ def test_a_column_can_say_which_episodes_terminated():
         episodes_from_table(table, **ROLES, terminated="end")
 
 
+@pytest.mark.parametrize("code", [2.0, -1.0, 0.5])
+def test_other_codes_of_an_end_are_refused(code):
+    """2 may say that a patient was censored, which is no termination."""
+    table = make_table()
+    table["end"] = np.where((table["id"] == 9) & (table["t"] == 14), code, 0.0)
+    with pytest.raises(InvalidDataError, match=f"1 values that are neither 0 nor 1, the first {code} in row 7"):
+        episodes_from_table(table, **ROLES, terminated="end")
+    table["end"] = table["end"] != 0
+    assert [episode.terminations[-1] for episode in episodes_from_table(table, **ROLES, terminated="end")] == [0, 1, 0]
+
+
+@pytest.mark.parametrize("zone", [None, "UTC", "America/New_York"])
+def test_dates_beyond_what_nanoseconds_hold_keep_their_order(zone):
+    days = np.array(["2020-01-01", "9999-12-31", "2300-01-01"], dtype="datetime64[us]")
+    when = pd.Series(days).dt.tz_localize("UTC").dt.tz_convert(zone) if zone else pd.Series(days)
+    frame = pd.DataFrame({"id": 1, "x": [0.0, 2.0, 1.0], "a": [0, 2, 1], "r": 0.0, "when": when})
+    roles = ROLES | {"order": "when", "observations": "x"}
+    (episode,) = episodes_from_table(frame, **roles, time="when")
+    assert episode.observations.tolist() == [0, 1, 2, 2]
+    assert episode.infos["time"].tolist() == [day.astype("datetime64[s]").astype(int) for day in days[[0, 2, 1]]]
+
+
+def test_ids_that_are_neither_numbers_nor_texts_are_told_by_their_type():
+    table = make_table()
+    table["id"] = table["id"].astype(object)
+    with pytest.raises(InvalidDataError, match="'id' holds int values; ids must be all numbers or all texts"):
+        episodes_from_table(table, **ROLES)
+    table["id"][3] = None
+    with pytest.raises(InvalidDataError, match="'id' has 1 missing"):
+        episodes_from_table(table, **ROLES)
+
+
 def test_every_kind_of_table_gives_the_same_episodes():
     table = make_table(shuffle=0)
     expected = episodes_from_table(table, **ROLES)
