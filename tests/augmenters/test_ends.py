@@ -115,7 +115,7 @@ def test_episodes_without_room_before_their_ends_are_named(form: StitchingAugmen
 
 def test_recorded_rewards_are_values_of_the_data(forms: list[StitchingAugmenter]) -> None:
     real = ending()
-    for form in forms:
+    for form in (replace(form, ends="generated") for form in forms):
         noisy = AugmentedDataset(real, form, factor=4)
         snapped = AugmentedDataset(real, replace(form, rewards="recorded"), factor=4)
         modelled = np.concatenate([noisy[n].rewards[noisy.provenance(n).mask] for n in range(12, 48)])
@@ -123,3 +123,12 @@ def test_recorded_rewards_are_values_of_the_data(forms: list[StitchingAugmenter]
         assert len(np.unique(modelled)) > 10
         assert set(np.unique(chosen)) <= {0.0, 1.0}
         np.testing.assert_array_equal(chosen, np.where(modelled > 0.5, 1.0, 0.0))
+
+
+def test_where_outcomes_are_paid_at_ends_that_stay_nothing_is_paid_before(forms: list[StitchingAugmenter]) -> None:
+    real = ending()
+    for form in forms:
+        data = AugmentedDataset(real, replace(form, observation_noise=True), factor=3)
+        generated = np.concatenate([data[n].rewards[data.provenance(n).mask] for n in range(12, 36)])
+        assert len(generated)
+        assert (generated == 0).all()
