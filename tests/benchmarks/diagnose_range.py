@@ -9,24 +9,22 @@ Writes `FOLDER/range.csv` and `FOLDER/range.md`.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from reread import Row, run, told
 
 from oat_gym import domains
-from oat_gym.benchmark.analysis import MEAN, Analysis, Finding
-from oat_gym.benchmark.grid import Table, format_number
+from oat_gym.benchmark.analysis import MEAN, Analysis
+from oat_gym.benchmark.grid import format_number
 from oat_gym.benchmark.results import read_results
 from oat_gym.benchmark.store import CellResult
 from oat_gym.benchmark.variants import NONE
-from oat_gym.cache import write_atomically
 from oat_gym.ope.intervals import return_bounds
 from oat_gym.source import Source
 
-Row = dict[str, str]
 Range = tuple[float, float]
 OUTCOMES: dict[str, Range] = {
     "sepsis-mdp-features": (-1.0, 1.0),
@@ -72,7 +70,7 @@ def rows_of(folder: Path, variants: Sequence[str]) -> list[Row]:
             head = {"dataset": name, "range": f"{format_number(low)} to {format_number(high)}", "estimator": family}
             errors = {"error": _error(plain, name, family), "error within": _error(inside, name, family)}
             changes = {
-                text: _text(analysis.finding(name, variant, family, "mae"))
+                text: told(analysis.finding(name, variant, family, "mae"))
                 for variant in variants
                 for text, analysis in ((variant, plain), (f"{variant} within", inside))
             }
@@ -84,7 +82,7 @@ def _over_all(plain: Analysis, inside: Analysis, family: str, variants: Sequence
     """Return the row of the mean over all tasks."""
     head = {"dataset": ALL, "range": "-", "estimator": family, "error": "-", "error within": "-"}
     return head | {
-        text: _text(analysis.over_all(variant, family, "mae"))
+        text: told(analysis.over_all(variant, family, "mae"))
         for variant in variants
         for text, analysis in ((variant, plain), (f"{variant} within", inside))
     }
@@ -98,33 +96,5 @@ def _error(analysis: Analysis, dataset: str, family: str) -> str:
     )
 
 
-def _text(found: Finding | None) -> str:
-    if found is None or found.improvement.n_seeds < 2:
-        return "-"
-    change = found.improvement
-    text = f"{change.value:.0f} ({change.low:.0f} to {change.high:.0f})"
-    return f"**{text}**" if change.verdict in ("helps", "hurts") else text
-
-
-def write(out: Path, rows: Sequence[Row]) -> None:
-    """Write the rows as CSV and as markdown."""
-    table = Table("range", CAPTION, tuple(rows[0]), tuple(tuple(row.values()) for row in rows))
-    out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / "range.csv", table.to_csv().replace("**", "").encode())
-    write_atomically(out / "range.md", table.to_markdown().encode())
-
-
-def main() -> None:
-    """Read the command line and write both files."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--variants", default="oat-paper,oat,jittering,scaling")
-    options = parser.parse_args()
-    rows = rows_of(options.results, options.variants.split(","))
-    write(options.out, rows)
-    print((options.out / "range.md").read_text())
-
-
 if __name__ == "__main__":
-    main()
+    run(rows_of, name="range", caption=CAPTION, description=__doc__, variants="oat-paper,oat,jittering,scaling")

@@ -10,19 +10,17 @@ part in them. Writes `FOLDER/use.csv` and `FOLDER/use.md`.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from oat_gym.benchmark.analysis import MEAN, Analysis, Finding
-from oat_gym.benchmark.grid import Table
+from reread import Row, run, told
+
+from oat_gym.benchmark.analysis import MEAN, Analysis
 from oat_gym.benchmark.results import Results, read_results
 from oat_gym.benchmark.store import CellResult
 from oat_gym.benchmark.variants import NONE
-from oat_gym.cache import write_atomically
 
-Row = dict[str, str]
 Choice = dict[str, str]
 """Family of estimators -> the variant whose data it is given."""
 CHOICE = (
@@ -106,43 +104,15 @@ def rows_of(folder: Path, variants: Sequence[str]) -> list[Row]:
             {
                 "method": name,
                 "used for": ", ".join(taken) or "none",
-                "everywhere": _text(always),
-                "as chosen": _text(found),
-                "another task": _text(chosen.over_all(CHOSEN, MEAN, "mae", between=True)),
-                "rank correlation": _text(chosen.over_all(CHOSEN, MEAN, "rank_correlation"), digits=2),
+                "everywhere": told(always),
+                "as chosen": told(found),
+                "another task": told(chosen.over_all(CHOSEN, MEAN, "mae", between=True)),
+                "rank correlation": told(chosen.over_all(CHOSEN, MEAN, "rank_correlation"), digits=2),
                 "datasets": "0" if found is None else str(len(found.datasets)),
             }
         )
     return rows
 
 
-def _text(found: Finding | None, *, digits: int = 0) -> str:
-    if found is None:
-        return "-"
-    change = found.improvement
-    text = f"{change.value:.{digits}f} ({change.low:.{digits}f} to {change.high:.{digits}f})"
-    return f"**{text}**" if change.verdict in ("helps", "hurts") else text
-
-
-def write(out: Path, rows: Sequence[Row]) -> None:
-    """Write the rows as CSV and as markdown."""
-    table = Table("use", CAPTION, tuple(rows[0]), tuple(tuple(row.values()) for row in rows))
-    out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / "use.csv", table.to_csv().replace("**", "").encode())
-    write_atomically(out / "use.md", table.to_markdown().encode())
-
-
-def main() -> None:
-    """Read the command line and write both files."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--variants", default="oat-paper,oat,oat-prior,jittering,scaling")
-    options = parser.parse_args()
-    rows = rows_of(options.results, options.variants.split(","))
-    write(options.out, rows)
-    print((options.out / "use.md").read_text())
-
-
 if __name__ == "__main__":
-    main()
+    run(rows_of, name="use", caption=CAPTION, description=__doc__, variants="oat-paper,oat,oat-prior,jittering,scaling")

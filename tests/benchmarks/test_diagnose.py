@@ -38,6 +38,12 @@ def load(name: str) -> ModuleType:
     return module
 
 
+@pytest.fixture(autouse=True)
+def beside_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scripts find what lies in their folder, as where they are run."""
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+
+
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
     return load("diagnose_steps")
@@ -176,7 +182,7 @@ def test_estimates_are_kept_within_what_policies_can_earn(tmp_path: Path) -> Non
     off = float(np.abs(true - true.mean()).mean())
     assert all(row["error within"] == format_number(off) and row["error"] != row["error within"] for row in rows)
     assert all(row["jittering within"] == "0 (0 to 0)" for row in (*rows, whole))  # one value is left for all
-    module.write(tmp_path, [*rows, whole])
+    load("reread").write(tmp_path, [*rows, whole], name="range", caption="Within")
     assert len((tmp_path / "range.csv").read_text().splitlines()) == len(rows) + 2
 
 
@@ -203,5 +209,5 @@ def test_synthetic_data_go_to_the_estimators_that_gained_elsewhere(tmp_path: Pat
     assert unchanged is not None and unchanged.improvement.value == 0
     rows = module.rows_of(tmp_path, variants)
     assert [row["method"] for row in rows] == [*variants, "best"]
-    module.write(tmp_path, rows)
+    load("reread").write(tmp_path, rows, name="use", caption="Use")
     assert len((tmp_path / "use.csv").read_text().splitlines()) == len(rows) + 1
