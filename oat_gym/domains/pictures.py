@@ -190,6 +190,6 @@ def _finish(figure: Figure, path: Path | None, *, legend: Axes | None = None) ->
         handles, labels = legend.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=_TEXT, frameon=False)
     if path is not None:
-        is_png = os.path.splitext(path)[1].lower() in ("", ".png")  # noqa: PTH122  (bytes of a path too)
+        is_png = os.path.splitext(path)[1].lower() in ("", ".png")  # noqa: PTH122  (a text, or any kind of path)
         figure.savefig(path, dpi=_DPI, metadata={"Software": None} if is_png else None)
     return figure

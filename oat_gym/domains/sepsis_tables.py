@@ -143,7 +143,7 @@ def check_clocks(tables: Tables) -> None:
 
     Raises `ConfigurationError` without pyarrow.
     """
-    schemas = {name: _schema(tables.file(name)) for name in TABLES}
+    schemas = {name: _parquet().read_schema(tables.file(name)) for name in TABLES}
     zones = {
         f"clif_{name}.{column}": schema.field(column).type.tz
         for name, schema in schemas.items()
@@ -159,12 +159,12 @@ def check_clocks(tables: Tables) -> None:
         )
 
 
-def _schema(file: Path) -> Any:
+def _parquet() -> Any:
     try:
         import pyarrow.parquet as pq  # noqa: PLC0415
     except ImportError as error:
         raise ConfigurationError("CLIF tables are read with pyarrow: pip install oat-gym[sepsis]") from error
-    return pq.read_schema(file)
+    return pq
 
 
 def read_table(tables: Tables, name: str, *, visits: Sequence[str] | None = None) -> Columns:
@@ -177,7 +177,7 @@ def read_table(tables: Tables, name: str, *, visits: Sequence[str] | None = None
         InvalidDataError: if the table or a column is missing, or a column has another type.
     """
     file, wanted = tables.file(name), TABLES[name]
-    schema = _schema(file)
+    schema = _parquet().read_schema(file)
     missing = [column for column in wanted if column not in schema.names]
     if missing:
         raise InvalidDataError(f"{file} lacks the columns {missing} of CLIF's table {name}; it has {schema.names}.")
@@ -188,9 +188,7 @@ def read_table(tables: Tables, name: str, *, visits: Sequence[str] | None = None
                 "as CLIF defines it."
             )
     chosen = None if visits is None else [("hospitalization_id", "in", list(visits))]
-    import pyarrow.parquet as pq  # noqa: PLC0415
-
-    table: Any = pq.read_table(file, columns=list(wanted), filters=chosen)
+    table = _parquet().read_table(file, columns=list(wanted), filters=chosen)
     return {column: _to_numpy(table[column], kind) for column, kind in wanted.items()}
 
 

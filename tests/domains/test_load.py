@@ -1,5 +1,6 @@
 """Loading by name, where data is looked for, and what is said when it is not there."""
 
+import contextlib
 import doctest
 import shutil
 from pathlib import Path
@@ -8,6 +9,7 @@ import minari
 import pytest
 
 from oat_gym import domains
+from oat_gym.cache import CacheEntry
 from oat_gym.domains import _data, adroit, maze2d, tutoring
 from oat_gym.errors import DatasetNotFoundError, OatGymError
 
@@ -117,3 +119,22 @@ def test_conversion_happens_once_and_follows_the_source(tmp_path):
     source.write_text("one")
     assert len(_data.converted("x", source, version=1, write=write)) == 250
     assert len(calls) == 4  # a damaged conversion is made again
+
+
+def test_a_conversion_survives_a_cache_that_is_cleared_while_it_waits(tmp_path, monkeypatch):
+    lock = CacheEntry.lock
+
+    @contextlib.contextmanager
+    def after_a_clear(entry: CacheEntry):
+        with lock(entry):
+            shutil.rmtree(entry.path)
+            yield
+
+    def write(folder: Path) -> minari.MinariDataset:
+        shutil.copytree(maze2d.umaze().storage.data_path, folder / "data")
+        return minari.MinariDataset(folder / "data")
+
+    source = tmp_path / "source"
+    source.write_text("cleared")
+    monkeypatch.setattr(CacheEntry, "lock", after_a_clear)
+    assert len(_data.converted("cleared", source, version=1, write=write)) == 250

@@ -190,3 +190,8 @@ def test_the_nearest_centre_stands_for_a_generated_observation():
     np.testing.assert_array_equal(view.recover(near), np.arange(40))
     table = np.random.default_rng(1).dirichlet(np.ones(3), size=40)
     np.testing.assert_allclose(view.policy(table).probabilities(near), table)
+
+
+def test_an_unknown_model_is_refused_with_the_names():
+    with pytest.raises(ConfigurationError, match="are icu-sepsis, sepsis-mdp; got 'icu'"):
+        sepsis_tabular.sepsis_model("icu")
