@@ -18,7 +18,7 @@ from oat_gym.ope.logged import Logged
 from oat_gym.ope.mlp_policy import MLPPolicy
 from oat_gym.ope.model_based import ModelBased
 from oat_gym.ope.policies import CategoricalPolicy, EpsilonGreedyPolicy, TabularPolicy, UniformPolicy
-from oat_gym.ope.policy import DiscretePolicy, Policy, PolicySet, PolicyStack, StackablePolicy
+from oat_gym.ope.policy import DiscretePolicy, Policy, PolicySet, PolicyStack, RepeatingStack, StackablePolicy
 from oat_gym.ope.problem import Part, Problem
 from oat_gym.ope.result import Result
 from oat_gym.ope.torch_policy import TorchCategoricalPolicy, TorchPolicy
@@ -59,6 +59,7 @@ __all__ = [
     "PolicySet",
     "PolicyStack",
     "Problem",
+    "RepeatingStack",
     "Result",
     "StackablePolicy",
     "TabularPolicy",

@@ -67,11 +67,11 @@ def action_choices(problem: Problem, observations: Batch, *, draws: int, rng: np
         n_actions = probabilities.shape[2]
         one_hot = np.broadcast_to(np.eye(n_actions)[:, None], (n_actions, probabilities.shape[1], n_actions))
         return Choices(one_hot, probabilities)
-    first = problem.policy_actions(observations, rng=rng)
+    actions = problem.policy_samples(observations, 1, rng=rng)
     mean = flatten_policies(problem.policies.mean(observations), problem.data.flat_actions, len(problem.policies))
-    more = 0 if np.array_equal(first, mean) else draws - 1
-    actions = np.stack([first, *(problem.policy_actions(observations, rng=rng) for _ in range(more))])
-    return Choices(actions, np.full((*first.shape[:2], len(actions)), 1.0 / len(actions)))
+    if draws > 1 and not np.array_equal(actions[0], mean):
+        actions = np.concatenate((actions, problem.policy_samples(observations, draws - 1, rng=rng)))
+    return Choices(actions, np.full((*mean.shape[:2], len(actions)), 1.0 / len(actions)))
 
 
 def expected_q(function: QFunction, states: FloatArray, choices: Choices, remaining: IntArray | None) -> FloatArray:

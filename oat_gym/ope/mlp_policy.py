@@ -147,11 +147,17 @@ class MLPStack:
 
     def sample(self, observations: Batch, *, rngs: Sequence[np.random.Generator]) -> npt.NDArray[Any]:
         """Return actions (Q, n, ...)."""
-        return self.mean(observations) if self.first.deterministic else self._actions(observations, rngs)
+        return self.samples(observations, rngs=[rngs])[:, 0]
+
+    def samples(self, observations: Batch, *, rngs: Sequence[Sequence[np.random.Generator]]) -> npt.NDArray[Any]:
+        """Return actions (Q, J, n, ...), the j-th drawn from `rngs[j]`."""
+        if self.first.deterministic:
+            return np.repeat(self._actions(observations, [None]), len(rngs), axis=1)
+        return self._actions(observations, rngs)
 
     def mean(self, observations: Batch) -> npt.NDArray[Any]:
         """Return the mean actions (Q, n, ...)."""
-        return self._actions(observations, None)
+        return self._actions(observations, [None])[:, 0]
 
     def log_prob(self, observations: Batch, actions: Batch) -> FloatArray:
         """Return log pi(a|s), (Q, n)."""
@@ -167,18 +173,21 @@ class MLPStack:
                 result[:, rows] = box.log_prob(taken[rows], mean, np.exp(log_std), censored=self.first.censored)
         return result
 
-    def _actions(self, observations: Batch, rngs: Sequence[np.random.Generator] | None) -> npt.NDArray[Any]:
+    def _actions(self, observations: Batch, rngs: Sequence[Sequence[np.random.Generator] | None]) -> npt.NDArray[Any]:
+        """Return (Q, J, n, ...): actions drawn from each of `rngs`, the mean ones for None."""
         box = ActionBox(self.first.action_space)
         precision = np.float32 if box.dtype == np.float32 else np.float64
         matrix = self._matrix(observations, precision)
-        result = np.empty((len(self.layers[0][0]), len(matrix), self.first.n_actions), dtype=box.dtype)
+        shape = (len(self.layers[0][0]), len(rngs), len(matrix))
+        result = np.empty((*shape, self.first.n_actions), dtype=box.dtype)
         for rows, mean, log_std in self._outputs(matrix):
-            flat = mean
-            if rngs is not None:
-                noise = np.stack([rng.standard_normal(mean.shape[1:], dtype=precision) for rng in rngs])
-                flat = mean + np.exp(log_std) * noise
-            result[:, rows] = np.clip(np.tanh(flat) if self.first.squash else flat, *box.bounds)
-        return result if box.space is None else result.reshape((*result.shape[:2], *box.space.shape))
+            for j, own in enumerate(rngs):
+                flat = mean
+                if own is not None:
+                    noise = np.stack([rng.standard_normal(mean.shape[1:], dtype=precision) for rng in own])
+                    flat = mean + np.exp(log_std) * noise
+                result[:, j, rows] = np.clip(np.tanh(flat) if self.first.squash else flat, *box.bounds)
+        return result if box.space is None else result.reshape((*shape, *box.space.shape))
 
     def _outputs(self, matrix: npt.NDArray[Any]) -> Iterator[tuple[slice, npt.NDArray[Any], npt.NDArray[Any]]]:
         """Yield rows, means (Q, m, A) and log standard deviations (Q, m or 1, A) of one chunk after another.

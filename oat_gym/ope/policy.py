@@ -63,6 +63,15 @@ class PolicyStack(Protocol):
 
 
 @runtime_checkable
+class RepeatingStack(PolicyStack, Protocol):
+    """A stack that can draw several actions in a state from one evaluation of its policies."""
+
+    def samples(self, observations: Batch, *, rngs: Sequence[Sequence[np.random.Generator]]) -> Batch:
+        """Return actions, leaves (Q, J, n, ...): the j-th are what `sample` draws from `rngs[j]`."""
+        ...
+
+
+@runtime_checkable
 class StackablePolicy(Policy, Protocol):
     """A policy that can be evaluated in one product with others of its architecture."""
 
@@ -127,6 +136,22 @@ class PolicySet:
         """
         rngs = streams(rng, len(self))
         return self._together(lambda numbers, stack: stack.sample(observations, rngs=[rngs[p] for p in numbers]))
+
+    def samples(self, observations: Batch, count: int, *, rng: np.random.Generator) -> Batch:
+        """Return what so many calls of `sample` return, leaves (P, count, n, ...).
+
+        A `RepeatingStack` is evaluated once for all of them.
+        """
+        rngs = [streams(rng, len(self)) for _ in range(count)]
+
+        def drawn(numbers: tuple[int, ...], stack: PolicyStack) -> Batch:
+            own = [[each[p] for p in numbers] for each in rngs]
+            if isinstance(stack, RepeatingStack):
+                return stack.samples(observations, rngs=own)
+            several = _join([stack.sample(observations, rngs=each) for each in own])
+            return map_tree(lambda leaf: leaf.swapaxes(0, 1), several)
+
+        return self._together(drawn)
 
     def mean(self, observations: Batch) -> Batch:
         """Return the mean actions of each policy, leaves (P, n, ...)."""

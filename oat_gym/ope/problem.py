@@ -92,10 +92,17 @@ class Problem:
         Raises:
             InvalidDataError: for a policy that returns actions which are not finite.
         """
-        drawn = self.policies.sample(observations, rng=rng)
-        actions = flatten_policies(drawn, self.data.flat_actions, len(self.policies))
-        for name, own in zip(self.policies.names, actions, strict=True):
-            check_finite_actions(name, own)
+        return self.policy_samples(observations, 1, rng=rng)[0]
+
+    def policy_samples(self, observations: Batch, count: int, *, rng: np.random.Generator) -> FloatArray:
+        """Return features of several actions of each policy, (count, P, n, A); see `policy_actions`."""
+        drawn, n_policies = self.policies.samples(observations, count, rng=rng), len(self.policies)
+        actions = np.empty((count, n_policies, tree_length(observations), self.data.flat_actions.layout.width))
+        for j, into in enumerate(actions):
+            one = map_tree(lambda leaf, j=j: leaf[:, j], drawn)
+            into[:] = flatten_policies(one, self.data.flat_actions, n_policies)
+            for name, own in zip(self.policies.names, into, strict=True):
+                check_finite_actions(name, own)
         return actions
 
     def policy_probabilities(self, observations: Batch) -> FloatArray | None:

@@ -27,7 +27,10 @@ def perceptron(seed: int, *, hidden: tuple[int, ...] = (16, 16), **settings) -> 
 
 
 def check_equal_to_each(policies: list[ope.Policy], observations: np.ndarray, actions: np.ndarray) -> None:
-    """Compare mean, log_prob and sample of the set with those of each policy; the set is evaluated twice."""
+    """Compare mean, log_prob and sample of the set with those of each policy; the set is evaluated twice.
+
+    Several samples at once are those of as many calls, to the last bit, and leave the generator where these leave it.
+    """
     together = ope.PolicySet.of(policies)
     rngs = streams(np.random.default_rng(11), len(policies))
     sampled = together.sample(observations, rng=np.random.default_rng(11))
@@ -38,6 +41,11 @@ def check_equal_to_each(policies: list[ope.Policy], observations: np.ndarray, ac
         np.testing.assert_allclose(log_probs[p], policy.log_prob(observations, actions), rtol=1e-9, atol=1e-6)
     np.testing.assert_array_equal(sampled, together.sample(observations, rng=np.random.default_rng(11)))
     assert not np.array_equal(sampled, together.sample(observations, rng=np.random.default_rng(12)))
+    once, often = np.random.default_rng(11), np.random.default_rng(11)
+    several = together.samples(observations, 3, rng=once)
+    for j in range(3):
+        np.testing.assert_array_equal(several[:, j], together.sample(observations, rng=often))
+    assert once.bit_generator.state == often.bit_generator.state
 
 
 @pytest.mark.parametrize(
