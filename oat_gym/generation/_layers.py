@@ -95,18 +95,19 @@ class Adam:
     def __init__(self, flat: Tensor, learning_rates: Tensor, *, clip: float, decay: float = 1.0) -> None:
         self._rates, self._clip, self._decay = learning_rates[:, None].clone(), clip, decay
         self._first, self._second = torch.zeros_like(flat), torch.zeros_like(flat)
+        self._change = torch.empty_like(flat)  # kept: new memory for a large network takes longer than its numbers
         self._updates = 0
 
     def step(self, flat: Tensor, gradient: Tensor) -> None:
-        """Update `flat` in place."""
+        """Update `flat` in place; `gradient` is clipped in place."""
         norm = gradient.norm(dim=1, keepdim=True)
-        gradient = gradient * (self._clip / norm).clamp(max=1.0)
+        gradient.mul_((self._clip / norm).clamp(max=1.0))
         self._updates += 1
         self._first.lerp_(gradient, 0.1)
         self._second.mul_(0.999).addcmul_(gradient, gradient, value=0.001)
         first_share, second_share = 1 - 0.9**self._updates, 1 - 0.999**self._updates
-        scale = (self._second / second_share).sqrt_().add_(1e-8)
-        flat.sub_((self._first / scale).mul_(self._rates / first_share))
+        scale = torch.div(self._second, second_share, out=self._change).sqrt_().add_(1e-8)
+        flat.sub_(torch.div(self._first, scale, out=self._change).mul_(self._rates / first_share))
         self._rates.mul_(self._decay)
 
 

@@ -21,7 +21,7 @@ from oat_gym.ope._densities import ActionHead
 from oat_gym.progress import ProgressCallback
 
 DENSITIES = ("auto", "gaussian", "censored", "tanh-gaussian", "mixture", "categorical")
-_CHUNK = 16384  # rows evaluated at a time
+_CHUNK = 1024  # rows of a network that are evaluated at a time: what is between the layers then stays in caches
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,8 @@ def train(
             if update % config.evaluate_every and update < config.max_updates:
                 continue
             with torch.no_grad():
-                held_out = (score(flat, tested) * share).sum(1)
+                scores = torch.cat([score(flat, some) for some in tested.split(_CHUNK, dim=1)], dim=1)
+            held_out = (scores * share).sum(1)
             tracker.look(update, likelihood, held_out, flat)
             _check_finite(tracker, names, update)
             progress("cloning the behaviour policy", update, config.max_updates)
