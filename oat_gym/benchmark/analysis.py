@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, product
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,10 @@ from oat_gym.domains import TASKS
 FloatArray = npt.NDArray[np.float64]
 MEAN = "mean"
 """In the place of a family: the average over the estimators."""
+RIVALS = ("oat-paper", "oat")
+"""The forms of OAT that every other variant is compared with."""
+RIVALRY: tuple[Metric, ...] = ("mae", "rank_correlation")
+"""The metrics by which they are: those of the paper's claim to be ahead of every other method."""
 
 
 @dataclass(frozen=True)
@@ -155,17 +160,22 @@ class Analysis:
         families = tuple(dict.fromkeys(name for each in found for name in each.families))
         return Finding(tuple(each.datasets[0] for each in found), variant, family, metric, mean, families, baseline)
 
-    def all_findings(self) -> Iterable[Finding]:
-        """Give the improvements of every dataset with known truth, variant, family and "mean", and metric."""
-        for dataset in self.with_truth():
-            for variant in self.results.variants:
-                if variant == NONE:
-                    continue
-                for family in (MEAN, *self.results.families):
-                    for metric in METRICS:
-                        found = self.finding(dataset, variant, family, metric)
-                        if found is not None:
-                            yield found
+    def all_findings(self, *, baseline: str = NONE) -> Iterable[Finding]:
+        """Give the improvements of every dataset with known truth, variant, family and "mean", and metric.
+
+        Over a form of OAT it gives those by the metrics of `RIVALRY`.
+        """
+        metrics = tuple(METRICS) if baseline == NONE else RIVALRY
+        variants = [name for name in self.results.variants if name not in (NONE, baseline)]
+        families = (MEAN, *self.results.families)
+        for dataset, variant, family, metric in product(self.with_truth(), variants, families, metrics):
+            found = self.finding(dataset, variant, family, metric, baseline=baseline)
+            if found is not None:
+                yield found
+
+    def comparisons(self) -> Iterable[Finding]:
+        """Give the improvements over no augmentation, and over each of `RIVALS`."""
+        return chain.from_iterable(self.all_findings(baseline=name) for name in (NONE, *RIVALS))
 
     def _seeds(self, dataset: str, sides: Sequence[str], families: Sequence[str]) -> tuple[int, ...]:
         """Return the seeds that both sides, variants, have for all of some families."""

@@ -67,7 +67,7 @@ def environment(device: str) -> dict[str, Any]:
         "commit": commit(),
         "python": platform.python_version(),
         **versions,
-        "machine": f"{platform.system()} {platform.machine()}",
+        "machine": f"{platform.system()} {platform.machine()} {torch.backends.cpu.get_cpu_capability()}",
         "device": device_name(device),
     }
 

@@ -1,9 +1,7 @@
-"""Results of a folder: its newest cells, tidy tables of them, and CSV and parquet files."""
+"""Results of a folder: its newest cells that can be compared, with the true values of the last run."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import logging
 import math
@@ -17,14 +15,10 @@ import numpy as np
 
 from oat_gym.benchmark.plan import read_manifests
 from oat_gym.benchmark.protocol import Question
-from oat_gym.benchmark.scores import METRICS, score
 from oat_gym.benchmark.store import CellResult, read_augmented, read_cells
 from oat_gym.benchmark.variants import NONE
-from oat_gym.cache import Arrays, write_atomically
-from oat_gym.errors import ConfigurationError
-from oat_gym.ope.intervals import bootstrap_interval, standard_error
+from oat_gym.cache import Arrays
 
-Row = dict[str, Any]
 _log = logging.getLogger(__name__)
 
 
@@ -203,91 +197,3 @@ def with_truth(cells: Iterable[CellResult], manifests: Sequence[Mapping[str, Any
         unknown = (math.nan, math.nan)
         pairs = np.array([truth.get(name, unknown) for name in cell.policies], dtype=np.float64).reshape(-1, 2)
         yield replace(cell, true=pairs[:, 0], true_errors=pairs[:, 1])
-
-
-def estimate_rows(results: Results) -> list[Row]:
-    """Return a row for each dataset, variant, estimator, seed and policy."""
-    rows: list[Row] = []
-    for cell in results.cells:
-        if cell.failed:
-            continue
-        errors = standard_error(cell.replicates)
-        low, high = bootstrap_interval(cell.replicates, n=int(cell.record["n_episodes"]))
-        for p, policy in enumerate(cell.policies):
-            numbers = {"value": cell.values[p], "standard_error": errors[p], "low": low[p], "high": high[p]}
-            numbers |= {"true": cell.true[p], "true_standard_error": cell.true_errors[p]}
-            rows.append(_head(cell) | {"policy": policy} | {name: float(value) for name, value in numbers.items()})
-    return rows
-
-
-def cell_rows(results: Results) -> list[Row]:
-    """Return a row for each dataset, variant, estimator and seed: metrics, costs, versions, why it failed."""
-    return [_head(cell) | _metrics(cell) | _costs(cell) | {"reason": cell.reason} for cell in results.cells]
-
-
-def _head(cell: CellResult) -> Row:
-    names = ("dataset", "task", "variant", "family", "estimator", "seed", "budget", "initial")
-    return {name: getattr(cell, name) for name in names}
-
-
-def _metrics(cell: CellResult) -> Row:
-    if cell.failed or not cell.knows_truth:
-        return dict.fromkeys(METRICS, math.nan)
-    return {name: float(score(cell.values, cell.true, name)) for name in METRICS}
-
-
-def _costs(cell: CellResult) -> Row:
-    cost, made = cell.record.get("cost", {}), cell.record.get("augmentation_cost", {})
-    costs = {name: cost.get(name, math.nan) for name in ("cpu_seconds", "wall_seconds", "peak_memory_mb")}
-    costs |= {"augment_cpu_seconds": made.get("cpu_seconds", math.nan), "augment_from_cache": made.get("from_cache")}
-    return costs | {"fingerprint": cell.record["fingerprint"]} | dict(cell.record["environment"])
-
-
-def write_tidy(results: Results, folder: Path) -> list[Path]:
-    """Write `estimates` and `cells` as CSV, and as parquet where pyarrow is installed; return the paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths: list[Path] = []
-    for name, rows in (("estimates", estimate_rows(results)), ("cells", cell_rows(results))):
-        if not rows:
-            continue
-        path = folder / f"{name}.csv"
-        write_atomically(path, to_csv(rows).encode())
-        paths.append(path)
-        written = _write_parquet(folder / f"{name}.parquet", rows)
-        paths += [written] if written else []
-    return paths
-
-
-def to_csv(rows: Sequence[Row]) -> str:
-    """Return rows as CSV; numbers that are not there are empty cells.
-
-    Raises:
-        ConfigurationError: without rows, since the columns would be unknown.
-    """
-    if not rows:
-        raise ConfigurationError("There are no rows to write.")
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: _cell(value) for name, value in row.items()} for row in rows)
-    return text.getvalue()
-
-
-def _cell(value: Any) -> Any:
-    if isinstance(value, float | np.floating):
-        return "" if math.isnan(value) else float(f"{value:.8g}")
-    return "" if value is None else value
-
-
-def _write_parquet(path: Path, rows: Sequence[Row]) -> Path | None:
-    try:
-        import pyarrow as pa  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
-        import pyarrow.parquet as pq  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        _log.info("pyarrow is not installed: %s is not written; the CSV file holds the same.", path.name)
-        return None
-    sink: Any = pa.BufferOutputStream()
-    pq.write_table(pa.Table.from_pylist(list(rows)), sink)
-    write_atomically(path, sink.getvalue().to_pybytes())
-    return path

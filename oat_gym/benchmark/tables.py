@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from oat_gym.benchmark import paper
-from oat_gym.benchmark.analysis import MEAN, Analysis, Finding
+from oat_gym.benchmark.analysis import MEAN, RIVALRY, RIVALS, Analysis, Finding
 from oat_gym.benchmark.grid import Table, format_number
 from oat_gym.benchmark.results import Results
 from oat_gym.benchmark.scores import METRICS, Metric
@@ -27,11 +27,6 @@ FLOOR = "mean recorded return"
 EXPERT = "expert"
 """Name of the policy that others are tested against in table 1."""
 
-RIVALS = ("oat-paper", "oat")
-"""The forms of OAT that every other variant is compared with."""
-RIVALRY: tuple[Metric, ...] = ("mae", "rank_correlation")
-"""The metrics by which they are: those of the paper's claim to be ahead of every other method."""
-
 
 def all_tables(analysis: Analysis) -> tuple[Table, ...]:
     """Return every table that the results fill at least one row of: the paper's, and those of other datasets."""
@@ -47,7 +42,6 @@ def all_tables(analysis: Analysis) -> tuple[Table, ...]:
         for baseline in RIVALS
     ]
     made += [overview_table(analysis, metric, baseline=name) for metric in RIVALRY for name in (NONE, *RIVALS)]
-    made.append(improvement_table(analysis))
     return tuple(table for table in made if table is not None)
 
 
@@ -189,26 +183,6 @@ def _verdict_text(found: Finding | None) -> str:
     words = ("helps", "hurts") if found.baseline == NONE else ("better", "worse")
     word = {"helps": f" {words[0]}", "hurts": f" {words[1]}"}.get(change.verdict, "")
     return f"{numbers[0]} ({numbers[1]} to {numbers[2]}){word}"
-
-
-def improvement_table(analysis: Analysis) -> Table | None:
-    """Return every improvement with its interval and verdict."""
-    rows = [_improvement_row(found) for found in analysis.all_findings()]
-    if not rows:
-        return None
-    caption = (
-        "Improvements over no augmentation with 95% intervals (errors in percent less error, others in their own unit; "
-        f"positive is better). {analysis.results.setting.describe()}."
-    )
-    header = ("dataset", "variant", "estimator", "metric", "without", "with", "improvement", "low", "high", "verdict")
-    return Table("improvements", caption, (*header, "seeds", "most uncertain by"), tuple(rows))
-
-
-def _improvement_row(found: Finding) -> tuple[str, ...]:
-    change = found.improvement
-    numbers = [format_number(number) for number in (change.before, change.after, change.value, change.low, change.high)]
-    head = (found.datasets[0], found.variant, found.family, METRICS[found.metric])
-    return (*head, *numbers, change.verdict, str(change.n_seeds), change.parts.main)
 
 
 def table_1(analysis: Analysis, dataset: str) -> Table | None:

@@ -20,10 +20,11 @@ from oat_gym.benchmark.grid import write_tables
 from oat_gym.benchmark.job import JobReport
 from oat_gym.benchmark.plan import Plan, make_plan, read_manifests, write_manifest
 from oat_gym.benchmark.protocol import SUITES, Question, Suite, find_suite
-from oat_gym.benchmark.results import Results, read_results, write_tidy
+from oat_gym.benchmark.results import Results, read_results
 from oat_gym.benchmark.runner import Listener, Pace, format_seconds, run
 from oat_gym.benchmark.story import best_sentences, groups_of
 from oat_gym.benchmark.tables import all_tables
+from oat_gym.benchmark.tidy import write_tidy
 from oat_gym.benchmark.variants import VARIANTS, Variant, find_variant, parse_variants
 from oat_gym.cli._output import prepare_folder
 from oat_gym.cli._shared import check_choice, out
@@ -208,7 +209,7 @@ def _finish(results: Results, folder: Path, asked: tuple[str, ...]) -> None:
     analysis = Analysis(results)
     if not results.cells:
         return
-    write_tidy(results, where)
+    write_tidy(analysis, where)
     write_tables(all_tables(analysis), where)
     for group, _ in groups_of(analysis):
         lines = best_sentences(analysis, group) if set(group[1]) & set(asked) else []

@@ -1,5 +1,6 @@
 """From cells to tables, figures and the page: numbers that are known beforehand come out where they belong."""
 
+import csv
 import dataclasses
 import math
 import re
@@ -16,7 +17,7 @@ from oat_gym.benchmark.grid import write_tables
 from oat_gym.benchmark.improvement import Parts
 from oat_gym.benchmark.page import make_page
 from oat_gym.benchmark.protocol import Question
-from oat_gym.benchmark.results import Results, Setting, cell_rows, estimate_rows, to_csv, with_truth, write_tidy
+from oat_gym.benchmark.results import Results, Setting, with_truth
 from oat_gym.benchmark.scores import METRICS
 from oat_gym.benchmark.store import CellResult, read_result, write_result
 from oat_gym.benchmark.story import (
@@ -29,6 +30,7 @@ from oat_gym.benchmark.story import (
     sentence,
 )
 from oat_gym.benchmark.tables import all_tables, dataset_table, help_table, overview_table, paper_table
+from oat_gym.benchmark.tidy import cell_rows, estimate_rows, improvement_of, improvement_rows, to_csv, write_tidy
 from oat_gym.errors import CacheError, ConfigurationError
 
 POLICIES = tuple(f"p{number}" for number in range(7))
@@ -194,7 +196,7 @@ def test_the_papers_averages_agree_with_its_single_tables() -> None:
 def test_all_tables_are_written_and_hold_what_they_say(analysis: Analysis, tmp_path: Path) -> None:
     tables = all_tables(analysis)
     names = {table.name for table in tables}
-    assert {"table-02", "table-03", "table-04", "improvements", "dataset-adroit-door-human"} <= names
+    assert {"table-02", "table-03", "table-04", "dataset-adroit-door-human"} <= names
     assert "table-01-adroit-door-human" in names  # one of the policies is called expert
     helped = next(table for table in tables if table.name == "helped-mae-adroit-door-human")
     cells = {row[0]: dict(zip(helped.header, row, strict=True)) for row in helped.rows}
@@ -204,7 +206,7 @@ def test_all_tables_are_written_and_hold_what_they_say(analysis: Analysis, tmp_p
     assert cells["jittering"]["seeds"] == "3" and cells["jittering"]["mean"].endswith(")")
     for table in tables:
         assert all(len(row) == len(table.header) for row in table.rows)
-        assert "3 seeds" in table.caption or table.name.startswith(("improvements", "table-01"))
+        assert "3 seeds" in table.caption or table.name.startswith("table-01")
     paths = write_tables(tables, tmp_path)
     assert (tmp_path / "tables.md") in paths
     assert "Table 3." in (tmp_path / "tables.md").read_text()
@@ -299,9 +301,27 @@ def test_tidy_rows_keep_every_number(analysis: Analysis, tmp_path: Path) -> None
     assert by_cell[0]["mae"] == pytest.approx(np.abs(first.values - TRUE).mean())
     assert all(math.isnan(row["mae"]) for row in by_cell if row["dataset"] == "logs")
     assert "NaN" not in to_csv(by_cell) and "nan" not in to_csv(by_cell).split("\n", 1)[1]
-    paths = {path.name for path in write_tidy(results, tmp_path)}
-    assert {"estimates.csv", "cells.csv", "estimates.parquet", "cells.parquet"} <= paths
+    paths = {path.name for path in write_tidy(analysis, tmp_path)}
+    assert {f"{name}.{kind}" for name in ("estimates", "cells", "improvements") for kind in ("csv", "parquet")} == paths
     assert pq.read_table(tmp_path / "estimates.parquet").num_rows == len(rows)
+
+
+def test_improvements_come_back_from_their_file(analysis: Analysis, tmp_path: Path) -> None:
+    """Means over tasks and verdicts of the rows of a file are those of the cells."""
+    write_tidy(analysis, tmp_path)
+    with (tmp_path / "improvements.csv").open(newline="") as file:
+        again = [improvement_of(row) for row in csv.DictReader(file)]
+    expected = list(analysis.comparisons())
+    assert len(again) == len(expected) > len(list(analysis.all_findings()))
+    for one, other in zip(again, expected, strict=True):
+        assert dataclasses.replace(one, improvement=other.improvement) == other
+        numbers = [
+            [*dataclasses.astuple(found.improvement.parts), *dataclasses.astuple(found.improvement)[1:7]]
+            for found in (one, other)
+        ]
+        assert numbers[0] == pytest.approx(numbers[1], rel=1e-6, nan_ok=True)
+        assert one.improvement.verdict == other.improvement.verdict
+    assert {row["baseline"] for row in improvement_rows(analysis)} == {"none", "oat-paper"}
 
 
 def test_the_page_says_it_all_and_loads_nothing(analysis: Analysis) -> None:

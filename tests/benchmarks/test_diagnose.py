@@ -211,3 +211,23 @@ def test_synthetic_data_go_to_the_estimators_that_gained_elsewhere(tmp_path: Pat
     assert [row["method"] for row in rows] == [*variants, "best"]
     load("reread").write(tmp_path, rows, name="use", caption="Use")
     assert len((tmp_path / "use.csv").read_text().splitlines()) == len(rows) + 1
+
+
+def test_only_equal_cells_of_two_machines_are_compared(script: ModuleType) -> None:
+    machines = load("diagnose_machines")
+    place, other = ("line", "none", "FQE"), ("line", "none", "IS")
+    ours = {
+        place: {
+            0: {"fingerprint": "a", "mae": "3"},
+            1: {"fingerprint": "b", "mae": "5"},
+            2: {"fingerprint": "c", "mae": "1"},
+        },
+        other: {0: {"fingerprint": "d", "mae": ""}},  # nobody knows the true values
+    }
+    theirs = {
+        place: {0: {"fingerprint": "a", "mae": "1"}, 1: {"fingerprint": "x", "mae": "5"}},
+        other: dict(ours[other]),
+    }
+    assert machines.pairs_of(ours, theirs) == {place: [(3.0, 1.0)]}
+    assert machines.apart(3.0, 1.0) == 100.0
+    assert machines.between_seeds([1.0, 3.0, 1.0]) == [100.0, 0.0, 100.0]

@@ -1,0 +1,244 @@
+"""Add folders of results to the published ones, and write the published tables and pictures anew.
+
+    python tests/benchmarks/publish.py [RESULTS ...] --into tests/benchmarks/results/benchmark
+
+Computing all cells takes tens of CPU hours, in parts and on several machines. What is published of them are three files
+of numbers: `cells.csv` (metrics of every cell), `improvements.csv` (every improvement with its variances) and
+`recorded.csv` (the mean recorded return of each dataset). All other tables and the pictures of bars come from these
+alone, so that nobody needs the cells to check them, or to add what a new run computed.
+
+A run's rows of a variant on a dataset replace the published ones where these are of fewer seeds or of another
+configuration. An improvement is of the run that computed the variant, over the same run's cells without augmentation.
+Where these are of another configuration than the published ones (other data, starts, estimators, versions of numpy or
+torch), everything published of that dataset is left out first. Only cells of the budget "standard" from reset starts
+are published.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import csv
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from oat_gym.benchmark import story
+from oat_gym.benchmark.analysis import Analysis, Finding
+from oat_gym.benchmark.budget import BUDGETS
+from oat_gym.benchmark.grid import Table
+from oat_gym.benchmark.protocol import SUITES, Question
+from oat_gym.benchmark.results import Results, Setting, read_results
+from oat_gym.benchmark.scores import Metric
+from oat_gym.benchmark.store import CellResult
+from oat_gym.benchmark.tables import all_tables, table_1
+from oat_gym.benchmark.tidy import Row, cell_rows, improvement_of, improvement_rows, to_csv
+from oat_gym.benchmark.variants import NONE, VARIANTS
+from oat_gym.cache import write_atomically
+
+SETTING = Setting("standard", Question())
+DATASETS = tuple(dict.fromkeys(name for suite in SUITES.values() for name in suite.datasets))
+FILES = ("cells", "improvements", "recorded")
+KEPT = ("dataset-", "helped-mae-", "helped-rank_correlation-", "against-oat-mae-", "overview-", "table-")
+"""How the names of the tables that are published begin."""
+_EMPTY = np.empty(0)
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The rows of the three files."""
+
+    cells: tuple[Row, ...]
+    improvements: tuple[Row, ...]
+    recorded: tuple[Row, ...]
+
+    @classmethod
+    def read(cls, folder: Path) -> Numbers:
+        """Return what a folder has; nothing of a file that is not there."""
+        return cls(*(_read(folder / f"{name}.csv") for name in FILES))
+
+    @classmethod
+    def of(cls, analysis: Analysis) -> Numbers:
+        """Return the rows of a run, without cells that failed."""
+        recorded: list[Row] = []
+        for name in analysis.with_truth():
+            floor = analysis.floor(name)
+            if floor is not None:
+                mean, error = analysis.results.recorded[name]
+                recorded.append({"dataset": name, "mean": mean, "standard_error": error, "mae": floor})
+        cells = [row for row in cell_rows(analysis.results) if not row["reason"]]
+        return cls(*(_texts(rows) for rows in (cells, improvement_rows(analysis), recorded)))
+
+    def write(self, folder: Path) -> None:
+        """Write the three files."""
+        for name in FILES:
+            write_atomically(folder / f"{name}.csv", to_csv(_sorted(getattr(self, name))).encode())
+
+
+def merged(old: Numbers, new: Numbers) -> Numbers:
+    """Return the published numbers with those of a run, by the rules above."""
+    before, after = _configurations(old.cells), _configurations(new.cells)
+    changed = {pair for pair in before.keys() & after.keys() if _differ(before[pair], after[pair])}
+    other = {name for name, variant in changed if variant == NONE}
+    more = {pair for pair, keys in after.items() if len(keys) > len(before.get(pair, ()))}
+    taken = {pair for pair in after if pair in changed | more or pair[0] in other}
+
+    def kept(rows: Sequence[Row]) -> list[Row]:
+        return [row for row in rows if row["dataset"] not in other and (row["dataset"], row["variant"]) not in taken]
+
+    def fresh(rows: Sequence[Row]) -> list[Row]:
+        return [row for row in rows if (row["dataset"], row["variant"]) in taken]
+
+    standing = [row for row in kept(old.improvements) if (row["dataset"], row["baseline"]) not in changed]
+    recorded = {row["dataset"]: row for row in (*old.recorded, *new.recorded)}
+    return Numbers(
+        cells=(*kept(old.cells), *fresh(new.cells)),
+        improvements=(*standing, *fresh(new.improvements)),
+        recorded=tuple(recorded.values()),
+    )
+
+
+def _configurations(rows: Iterable[Row]) -> dict[tuple[str, str], dict[tuple[str, str], str]]:
+    """Return (dataset, variant) -> (family, seed) -> fingerprint."""
+    found: dict[tuple[str, str], dict[tuple[str, str], str]] = {}
+    for row in rows:
+        found.setdefault((row["dataset"], row["variant"]), {})[row["family"], row["seed"]] = row["fingerprint"]
+    return found
+
+
+def _differ(keys: dict[tuple[str, str], str], others: dict[tuple[str, str], str]) -> bool:
+    return any(keys[place] != others[place] for place in keys.keys() & others.keys())
+
+
+class Published(Analysis):
+    """Published numbers in the place of cells: what tables and pictures of bars need to know."""
+
+    def __init__(self, numbers: Numbers) -> None:
+        self._rows, self._floors = numbers.cells, {row["dataset"]: float(row["mae"]) for row in numbers.recorded}
+        super().__init__(_results(numbers.cells))
+        found = [improvement_of(row) for row in numbers.improvements]
+        self._known = tuple(name for name in self.results.datasets if name in {each.datasets[0] for each in found})
+        self._found = {
+            (each.datasets[0], each.variant, each.family, each.metric, each.baseline): each for each in found
+        }
+        self._scores = {(row["dataset"], row["variant"], row["family"], int(row["seed"])): row for row in numbers.cells}
+
+    def finding(
+        self, dataset: str, variant: str, family: str, metric: Metric, *, baseline: str = NONE
+    ) -> Finding | None:
+        """Return a published improvement."""
+        return self._found.get((dataset, variant, family, metric, baseline))
+
+    def scores(
+        self, dataset: str, variant: str, family: str, metric: Metric, *, seeds: Sequence[int] | None = None
+    ) -> np.ndarray:
+        """Return a published metric of each seed."""
+        there = [cell.seed for cell in super().cells(dataset, variant, family)] if seeds is None else seeds
+        texts = [self._scores[dataset, variant, family, seed][metric] for seed in there]
+        return np.array([float(text) if text != "" else math.nan for text in texts])
+
+    def floor(self, dataset: str) -> float | None:
+        """Return the published error of the mean recorded return."""
+        return self._floors.get(dataset)
+
+    def cells(self, dataset: str, variant: str, family: str) -> tuple[CellResult, ...]:
+        """Return nothing: estimates are not published."""
+        return ()
+
+
+def _results(rows: Iterable[Row]) -> Results:
+    """Return cells that have no estimates, in the order of the suites."""
+    heads = ("dataset", "task", "variant", "family", "estimator", "budget", "initial")
+    cells = tuple(
+        CellResult(
+            **{name: row[name] for name in heads}, seed=int(row["seed"]), policies=(), values=_EMPTY, replicates=_EMPTY,
+            true=_EMPTY, true_errors=_EMPTY, reason="", record={"fingerprint": row["fingerprint"]},
+        )
+        for row in rows
+    )  # fmt: skip
+    manifest: dict[str, Any] = {
+        "datasets": DATASETS,
+        "jobs_order": tuple(VARIANTS),
+        "missing": {},
+        "budget_line": BUDGETS[SETTING.budget].describe(),
+        "cells": {str(number): cell.record["fingerprint"] for number, cell in enumerate(cells)},
+    }
+    return Results(SETTING, cells, (manifest,), ())
+
+
+def tables_of(published: Published, runs: Sequence[Analysis]) -> list[Table]:
+    """Return the tables that are published; table 1 needs the estimates of a run."""
+    tables = [table for table in all_tables(published) if table.name.startswith(KEPT)]
+    first = (table_1(run, name) for run in runs for name in run.results.datasets)
+    return tables + [table for table in first if table is not None]
+
+
+def pictures_of(published: Published) -> dict[str, bytes]:
+    """Return file name -> PNG of the bars of every group of datasets, and of the levels of human involvement."""
+    drawn = {
+        f"bars-{_slug(group[0])}": story.bars(published, group, level=level)
+        for group, level in story.groups_of(published)
+    }
+    drawn["by-level"] = story.by_level(published)
+    return {f"{name}.png": base64.b64decode(picture.data) for name, picture in drawn.items() if picture is not None}
+
+
+def _slug(title: str) -> str:
+    return title.partition(":")[0].lower().replace(" ", "-")
+
+
+def publish(runs: Sequence[Path], into: Path) -> Numbers:
+    """Merge the runs into a folder, write all of its tables and pictures, and return its numbers."""
+    analyses = [Analysis(results) for path in runs for results in read_results(path) if results.setting == SETTING]
+    numbers = Numbers.read(into)
+    for analysis in analyses:
+        numbers = merged(numbers, Numbers.of(analysis))
+    numbers.write(into)
+    published = Published(Numbers.read(into))
+    tables = {f"{table.name}.md": table for table in tables_of(published, analyses)}
+    for name, table in tables.items():
+        write_atomically(into / name, table.to_markdown().encode())
+    for path in into.glob("*.md"):
+        if path.name.startswith(KEPT) and path.name not in tables and not path.name.startswith("table-01"):
+            path.unlink()
+    for name, image in pictures_of(published).items():
+        write_atomically(into / name, image)
+    return numbers
+
+
+def _read(path: Path) -> tuple[Row, ...]:
+    if not path.exists():
+        return ()
+    with path.open(newline="") as file:
+        return tuple(csv.DictReader(file))
+
+
+def _texts(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Return rows as they come back from a CSV file."""
+    return tuple(csv.DictReader(to_csv(rows).splitlines())) if rows else ()
+
+
+def _sorted(rows: Sequence[Row]) -> list[Row]:
+    names = ("baseline", "variant", "family", "metric")
+    place = {name: number for number, name in enumerate(DATASETS)}
+    return sorted(
+        rows, key=lambda row: (place[row["dataset"]], *(row.get(name, "") for name in names), row.get("seed"))
+    )
+
+
+def main() -> None:
+    """Read the command line and publish."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="*", type=Path, metavar="RESULTS")
+    parser.add_argument("--into", type=Path, required=True)
+    options = parser.parse_args()
+    numbers = publish(options.runs, options.into)
+    print(f"{len(numbers.cells)} cells, {len(numbers.improvements)} improvements, {len(numbers.recorded)} datasets")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""Published numbers: tables come out of them as they do of the cells, and a new run adds to them and loses nothing."""
+
+import dataclasses
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from oat_gym.benchmark.analysis import Analysis
+from oat_gym.benchmark.results import Results
+from oat_gym.benchmark.store import CellResult
+from oat_gym.benchmark.tables import all_tables
+from tests.benchmark.test_report import ERRORS, cell, results_of
+
+DATASETS = {"adroit-door-human": True, "maze2d-umaze": True, "maze2d-umaze-d4rl": True}
+PUBLISHED = Path(__file__).parent / "results" / "benchmark"
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("publish", Path(__file__).with_name("publish.py"))
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def run_of(*cells: CellResult) -> Analysis:
+    """A run of one dataset with some cells in the place of its own."""
+    whole = results_of({"adroit-door-human": True})
+    places = {(part.variant, part.family, part.seed) for part in cells}
+    others = [part for part in whole.cells if (part.variant, part.family, part.seed) not in places]
+    return Analysis(dataclasses.replace(whole, cells=(*others, *cells)))
+
+
+def only(analysis: Analysis, *variants: str) -> Analysis:
+    results: Results = analysis.results
+    cells = tuple(part for part in results.cells if part.variant in variants)
+    return Analysis(dataclasses.replace(results, cells=cells))
+
+
+def improvements(numbers: object, variant: str) -> list[dict]:
+    return [row for row in numbers.improvements if row["variant"] == variant]  # type: ignore[attr-defined]
+
+
+def test_tables_of_published_numbers_are_those_of_the_cells(script: ModuleType, tmp_path: Path) -> None:
+    analysis = Analysis(results_of(DATASETS))
+    script.Numbers.of(analysis).write(tmp_path)
+    published = script.Published(script.Numbers.read(tmp_path))
+    expected = {table.name: table for table in all_tables(analysis) if not table.name.startswith("table-01")}
+    found = {table.name: table for table in all_tables(published)}
+    assert set(found) == set(expected)
+    for name, table in found.items():
+        assert table.header == expected[name].header
+        assert sorted(table.rows) == sorted(expected[name].rows), name
+
+
+def test_a_run_adds_its_variants_and_leaves_the_others(script: ModuleType) -> None:
+    whole = Analysis(results_of({"adroit-door-human": True}))
+    old = script.Numbers.of(only(whole, "none", "oat-paper"))
+    added = script.merged(old, script.Numbers.of(only(whole, "none", "jittering", "scaling")))
+    assert improvements(added, "oat-paper") == improvements(old, "oat-paper")
+    assert {row["variant"] for row in added.cells} == set(ERRORS)
+    assert len(added.cells) == len(script.Numbers.of(whole).cells)
+    assert {row["baseline"] for row in improvements(added, "jittering")} == {"none"}  # that run had no OAT
+    again = script.merged(added, script.Numbers.of(only(whole, "none", "jittering")))
+    assert sorted(map(str, again.cells)) == sorted(map(str, added.cells))
+
+
+def test_more_seeds_and_other_settings_replace_what_is_published(script: ModuleType) -> None:
+    whole = Analysis(results_of({"adroit-door-human": True}))
+    old = script.Numbers.of(whole)
+    fourth = [
+        cell("adroit-door-human", name, family, 3, error=ERRORS[name])
+        for name in ("none", "scaling")
+        for family in ("FQE", "IS")
+    ]
+    more = script.merged(old, script.Numbers.of(only(run_of(*fourth), "none", "scaling")))
+    assert {row["seeds"] for row in improvements(more, "scaling")} == {"4"}
+    assert {row["seeds"] for row in improvements(more, "jittering")} == {"3"}
+    part = cell("adroit-door-human", "oat-paper", "FQE", 0, error=1.0)
+    part = dataclasses.replace(part, record=dict(part.record) | {"fingerprint": "other"})
+    other = script.merged(old, script.Numbers.of(only(run_of(part), "none", "oat-paper")))
+    assert improvements(other, "oat-paper") != improvements(old, "oat-paper")
+    assert {row["baseline"] for row in improvements(other, "scaling")} == {"none"}  # those over the former are gone
+
+
+def test_another_ground_leaves_out_all_that_was_published_of_a_dataset(script: ModuleType) -> None:
+    old = script.Numbers.of(Analysis(results_of(DATASETS)))
+    ground = [cell("adroit-door-human", "none", "FQE", seed, error=50.0) for seed in range(3)]
+    ground = [dataclasses.replace(c, record=dict(c.record) | {"fingerprint": f"other{c.seed}"}) for c in ground]
+    new = script.merged(old, script.Numbers.of(only(run_of(*ground), "none", "scaling")))
+    assert {row["variant"] for row in new.cells if row["dataset"] == "adroit-door-human"} == {"none", "scaling"}
+    assert {row["variant"] for row in new.cells if row["dataset"] == "maze2d-umaze"} == set(ERRORS)
+
+
+def test_what_is_published_is_what_its_numbers_say(script: ModuleType) -> None:
+    """Every committed table is that of the committed numbers; table 1 needs estimates and is left out."""
+    published = script.Published(script.Numbers.read(PUBLISHED))
+    tables = script.tables_of(published, ())
+    assert len(tables) > 60
+    for table in tables:
+        assert (PUBLISHED / f"{table.name}.md").read_text() == table.to_markdown(), table.name
+    written = {path.stem for path in PUBLISHED.glob("*.md") if path.stem.startswith(script.KEPT)}
+    assert written == {table.name for table in tables} | {"table-01-tutor-sim"}
