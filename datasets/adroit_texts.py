@@ -95,7 +95,8 @@ Made with {versions} by `{command}`.
 python datasets/build_adroit.py {arguments}
 ```
 
-`domains.load` makes them on first use, in the cache; the same seed and library versions give the same bytes.
+`domains.load` makes them on first use, in the cache; the same seed and library versions give the same bytes on one kind
+of processor. Another rounds the actions of policies otherwise, of which the simulator soon makes other roll-outs.
 
 ## Origin, licence, use
 

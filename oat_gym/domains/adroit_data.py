@@ -49,7 +49,8 @@ def expert_dataset(name: str, *, steps: int | None = None, seed: int = 0) -> Min
     Episodes last 100 (pen) or 200 steps and never terminate; the last is cut where the number of steps is reached.
     Actions are recorded as clipped to [-1, 1]. infos: `success`, `stock_reward` and `log_prob`, the expert's
     log-probability of the clipped action. Each episode's `seed` metadata resets the environment to its start, from
-    which its actions replay it.
+    which its actions replay it. Processors round the expert's actions differently, so that each kind of them has
+    roll-outs of its own.
 
     Args:
         name: the task.

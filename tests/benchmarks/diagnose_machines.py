@@ -29,12 +29,14 @@ Cells = dict[tuple[str, str, str], dict[int, dict[str, str]]]
 
 
 def pairs_of(ours: Cells, theirs: Cells) -> dict[tuple[str, str, str], list[tuple[float, float]]]:
-    """Return place -> the errors of both machines in each seed whose cells have one fingerprint."""
+    """Return place -> the errors of both machines in each seed whose cells have one fingerprint; not of one cell."""
     found: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for place, seeds in ours.items():
         for seed, row in seeds.items():
             other = theirs.get(place, {}).get(seed)
-            if other is not None and other["fingerprint"] == row["fingerprint"] and row["mae"] != "":
+            if other is None or other["fingerprint"] != row["fingerprint"] or row["mae"] == "":
+                continue
+            if (other["commit"], other["cpu_seconds"]) != (row["commit"], row["cpu_seconds"]):
                 found.setdefault(place, []).append((float(row["mae"]), float(other["mae"])))
     return found
 

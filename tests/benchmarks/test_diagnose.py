@@ -216,18 +216,15 @@ def test_synthetic_data_go_to_the_estimators_that_gained_elsewhere(tmp_path: Pat
 def test_only_equal_cells_of_two_machines_are_compared(script: ModuleType) -> None:
     machines = load("diagnose_machines")
     place, other = ("line", "none", "FQE"), ("line", "none", "IS")
+
+    def row(fingerprint: str, mae: str, seconds: str = "1.0") -> dict[str, str]:
+        return {"fingerprint": fingerprint, "mae": mae, "commit": "c", "cpu_seconds": seconds}
+
     ours = {
-        place: {
-            0: {"fingerprint": "a", "mae": "3"},
-            1: {"fingerprint": "b", "mae": "5"},
-            2: {"fingerprint": "c", "mae": "1"},
-        },
-        other: {0: {"fingerprint": "d", "mae": ""}},  # nobody knows the true values
+        place: {0: row("a", "3"), 1: row("b", "5"), 2: row("c", "1"), 3: row("d", "7", "2.0")},
+        other: {0: row("e", "")},  # nobody knows the true values
     }
-    theirs = {
-        place: {0: {"fingerprint": "a", "mae": "1"}, 1: {"fingerprint": "x", "mae": "5"}},
-        other: dict(ours[other]),
-    }
+    theirs = {place: {0: row("a", "1", "9.0"), 1: row("x", "5"), 3: row("d", "7", "2.0")}, other: {0: row("e", "")}}
     assert machines.pairs_of(ours, theirs) == {place: [(3.0, 1.0)]}
     assert machines.apart(3.0, 1.0) == 100.0
     assert machines.between_seeds([1.0, 3.0, 1.0]) == [100.0, 0.0, 100.0]
