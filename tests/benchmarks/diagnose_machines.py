@@ -67,8 +67,8 @@ def rows_of(folder: Path, variants: Sequence[str]) -> list[Row]:
         if machines and seeds:
             numbers = {
                 "two machines, median": np.median(machines),
-                "upper quartile": np.quantile(machines, 0.75),
-                "greatest": np.max(machines),
+                "two machines, upper quartile": np.quantile(machines, 0.75),
+                "two machines, greatest": np.max(machines),
                 "two seeds, median": np.median(seeds),
             }
             row = {"estimator": family, "cells": str(len(machines)), "datasets": str(len(own))}
