@@ -118,7 +118,7 @@ class Published(Analysis):
     """Published numbers in the place of cells: what tables and pictures of bars need to know."""
 
     def __init__(self, numbers: Numbers) -> None:
-        self._rows, self._floors = numbers.cells, {row["dataset"]: float(row["mae"]) for row in numbers.recorded}
+        self._floors = {row["dataset"]: float(row["mae"]) for row in numbers.recorded}
         super().__init__(_results(numbers.cells))
         found = [improvement_of(row) for row in numbers.improvements]
         self._known = tuple(name for name in self.results.datasets if name in {each.datasets[0] for each in found})
