@@ -96,7 +96,9 @@ python datasets/build_adroit.py {arguments}
 ```
 
 `domains.load` makes them on first use, in the cache; the same seed and library versions give the same bytes on one kind
-of processor. Another rounds the actions of policies otherwise, of which the simulator soon makes other roll-outs.
+of processor. Torch's MKL has other kernels for Intel's than for others, which round the actions of policies otherwise,
+and of that the simulator soon makes other roll-outs. With `MKL_CBWR=COMPATIBLE OPENBLAS_CORETYPE=Haswell` in the
+environment all make the same.
 
 ## Origin, licence, use
 

@@ -49,8 +49,9 @@ def expert_dataset(name: str, *, steps: int | None = None, seed: int = 0) -> Min
     Episodes last 100 (pen) or 200 steps and never terminate; the last is cut where the number of steps is reached.
     Actions are recorded as clipped to [-1, 1]. infos: `success`, `stock_reward` and `log_prob`, the expert's
     log-probability of the clipped action. Each episode's `seed` metadata resets the environment to its start, from
-    which its actions replay it. Processors round the expert's actions differently, so that each kind of them has
-    roll-outs of its own.
+    which its actions replay it. Torch's MKL has other kernels for Intel's processors than for others, which round the
+    expert's actions otherwise, so that they have other roll-outs; MKL_CBWR=COMPATIBLE and OPENBLAS_CORETYPE=Haswell in
+    the environment even that.
 
     Args:
         name: the task.

@@ -10,8 +10,9 @@ alone, so that nobody needs the cells to check them, or to add what a new run co
 A run's rows of a variant on a dataset replace the published ones where these are of fewer seeds or of another
 configuration. An improvement is of the run that computed the variant, over the same run's cells without augmentation.
 Where these are of another configuration than the published ones (other data, starts, estimators, versions of numpy or
-torch), everything published of that dataset is left out first. Only cells of the budget "standard" from reset starts
-are published.
+torch), everything published of that dataset is left out first. A run that computes published variants anew, the same
+seeds and configurations, adds improvements over a baseline that they were not compared with. Only cells of the budget
+"standard" from reset starts are published.
 """
 
 from __future__ import annotations
@@ -93,13 +94,25 @@ def merged(old: Numbers, new: Numbers) -> Numbers:
     def fresh(rows: Sequence[Row]) -> list[Row]:
         return [row for row in rows if (row["dataset"], row["variant"]) in taken]
 
+    same = {pair for pair, keys in after.items() if pair in taken or before.get(pair) == keys}
     standing = [row for row in kept(old.improvements) if (row["dataset"], row["baseline"]) not in changed]
+    compared = {_comparison(row) for row in (*standing, *fresh(new.improvements))}
+    more_pairs = [
+        row
+        for row in new.improvements
+        if _comparison(row) not in compared
+        and {(row["dataset"], row["variant"]), (row["dataset"], row["baseline"])} <= same
+    ]
     recorded = {row["dataset"]: row for row in (*old.recorded, *new.recorded)}
     return Numbers(
         cells=(*kept(old.cells), *fresh(new.cells)),
-        improvements=(*standing, *fresh(new.improvements)),
+        improvements=(*standing, *fresh(new.improvements), *more_pairs),
         recorded=tuple(recorded.values()),
     )
+
+
+def _comparison(row: Row) -> tuple[str, ...]:
+    return tuple(row[name] for name in ("dataset", "variant", "family", "metric", "baseline"))
 
 
 def _configurations(rows: Iterable[Row]) -> dict[tuple[str, str], dict[tuple[str, str], str]]:

@@ -228,3 +228,21 @@ def test_only_equal_cells_of_two_machines_are_compared(script: ModuleType) -> No
     assert machines.pairs_of(ours, theirs) == {place: [(3.0, 1.0)]}
     assert machines.apart(3.0, 1.0) == 100.0
     assert machines.between_seeds([1.0, 3.0, 1.0]) == [100.0, 0.0, 100.0]
+
+
+def test_equal_bytes_of_two_processors_have_one_letter(monkeypatch: pytest.MonkeyPatch) -> None:
+    processors = load("diagnose_processors")
+    rounding = np.array([0.1 + 0.2, 1.0]), np.array([0.3, 1.0])
+
+    def measured(vendor: str, variables: dict[str, str], folder: Path) -> dict[str, object]:
+        first = "MKL_CBWR" in variables or vendor == "intel"
+        return {"FQE": processors.digest([rounding[0 if first else 1]]), "CPU s, FQE": 1.25}
+
+    monkeypatch.setattr(processors, "measured", measured)
+    rows = processors.rows_of()
+    assert len({(row["kernels of MKL"], row["settings"]) for row in rows}) == len(rows)
+    assert {row["FQE"] for row in rows if row["kernels of MKL"] == "intel"} == {"a"}
+    plain = [row["FQE"] for row in rows if row["kernels of MKL"] == "other" and "MKL" not in row["settings"]]
+    evened = [row["FQE"] for row in rows if "MKL" in row["settings"]]
+    assert set(plain) == {"b"} and set(evened) == {"a"}
+    assert {row["CPU s, FQE"] for row in rows} == {"1.2"}

@@ -70,6 +70,20 @@ def test_a_run_adds_its_variants_and_leaves_the_others(script: ModuleType) -> No
     assert sorted(map(str, again.cells)) == sorted(map(str, added.cells))
 
 
+def test_a_run_of_published_variants_adds_comparisons_that_were_not_there(script: ModuleType) -> None:
+    whole = Analysis(results_of({"adroit-door-human": True}))
+    old = script.merged(
+        script.Numbers.of(only(whole, "none", "oat-paper")), script.Numbers.of(only(whole, "none", "jittering"))
+    )
+    assert {row["baseline"] for row in improvements(old, "jittering")} == {"none"}
+    more = script.merged(old, script.Numbers.of(only(whole, "oat-paper", "none", "jittering")))
+    assert {row["baseline"] for row in improvements(more, "jittering")} == {"none", "oat-paper"}
+    assert {str(row) for row in old.improvements} <= {str(row) for row in more.improvements}
+    fewer = [part for part in whole.results.cells if part.seed > 0 or part.variant != "oat-paper"]
+    two_seeds = Analysis(dataclasses.replace(whole.results, cells=tuple(fewer)))
+    assert script.merged(old, script.Numbers.of(only(two_seeds, "oat-paper", "none", "jittering"))) == old
+
+
 def test_more_seeds_and_other_settings_replace_what_is_published(script: ModuleType) -> None:
     whole = Analysis(results_of({"adroit-door-human": True}))
     old = script.Numbers.of(whole)
