@@ -58,7 +58,7 @@ def paper_table(analysis: Analysis, level: str, metric: Metric) -> Table | None:
     if not any(datasets.values()):
         return None
     rows = [
-        (family, _method(variant), *_pairs(analysis, datasets, level, metric, family=family, variant=variant))
+        (family, method_name(variant), *_pairs(analysis, datasets, level, metric, family=family, variant=variant))
         for family in analysis.results.families
         for variant in analysis.results.variants
     ]
@@ -83,7 +83,7 @@ def table_2(analysis: Analysis) -> Table | None:
                 for metric in METRICS
                 for text in _pairs(analysis, {task: dataset}, "human", metric, family=MEAN, variant=variant)
             ]
-            rows.append((task, _method(variant), *cells))
+            rows.append((task, method_name(variant), *cells))
     header = ("task", "method", *(text for name in METRICS.values() for text in (name, "paper")))
     caption = f"Table 2. Averages over the estimators, Adroit human. {_notes(analysis, datasets)}"
     return Table("table-02", caption, header, tuple(rows))
@@ -197,7 +197,12 @@ def table_1(analysis: Analysis, dataset: str) -> Table | None:
         return None
     others = [name for name in cells[0].policies if name != EXPERT]
     rows = [
-        (_method(variant), method, *_tests(analysis, dataset, variant, others, method), _paper_tests(variant, method))
+        (
+            method_name(variant),
+            method,
+            *_tests(analysis, dataset, variant, others, method),
+            _paper_tests(variant, method),
+        )
         for variant in analysis.results.variants
         for method in ("paper", "paired")
         if analysis.cells(dataset, variant, "IS")
@@ -297,7 +302,7 @@ def _printed(number: paper.Printed, metric: Metric) -> str:
     return text if math.isnan(number.deviation) else f"{text} ± {number.deviation:.{digits}f}"
 
 
-def _method(variant: str) -> str:
+def method_name(variant: str) -> str:
     """Return a variant's name, with the paper's where it repeats a row of its tables."""
     row = VARIANTS[variant].paper if variant in VARIANTS else ""
     return f"{row} ({variant})" if row and row.lower() != variant else row or variant

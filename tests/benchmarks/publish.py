@@ -22,7 +22,7 @@ import base64
 import csv
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ from oat_gym.benchmark.protocol import SUITES, Question
 from oat_gym.benchmark.results import Results, Setting, read_results
 from oat_gym.benchmark.scores import Metric
 from oat_gym.benchmark.store import CellResult
-from oat_gym.benchmark.tables import all_tables, table_1
+from oat_gym.benchmark.tables import all_tables, method_name, table_1
 from oat_gym.benchmark.tidy import Row, cell_rows, improvement_of, improvement_rows, to_csv
 from oat_gym.benchmark.variants import NONE, VARIANTS
 from oat_gym.cache import write_atomically
@@ -183,11 +183,24 @@ def _results(rows: Iterable[Row]) -> Results:
     return Results(SETTING, cells, (manifest,), ())
 
 
-def tables_of(published: Published, runs: Sequence[Analysis]) -> list[Table]:
+def tables_of(published: Published, runs: Sequence[Analysis], into: Path) -> list[Table]:
     """Return the tables that are published; table 1 needs the estimates of a run."""
     tables = [table for table in all_tables(published) if table.name.startswith(KEPT)]
     first = (table_1(run, name) for run in runs for name in run.results.datasets)
-    return tables + [table for table in first if table is not None]
+    return tables + [with_former_rows(table, into / f"{table.name}.md") for table in first if table is not None]
+
+
+def with_former_rows(table: Table, path: Path) -> Table:
+    """Return a run's table 1 with the published rows of methods that the run does not have, in the usual order."""
+    if not path.exists():
+        return table
+    lines = [line for line in path.read_text().splitlines() if line.startswith("| ")][2:]
+    rows = {tuple(cells[:2]): cells for cells in (tuple(line[2:-2].split(" | ")) for line in lines)}
+    rows |= {row[:2]: row for row in table.rows}
+    order = [method_name(variant) for variant in VARIANTS]
+    place = {name: number for number, name in enumerate(order)}
+    ordered = sorted(rows.values(), key=lambda row: place.get(row[0], len(order)))  # stable: tests stay as they were
+    return replace(table, rows=tuple(ordered))
 
 
 def pictures_of(published: Published) -> dict[str, bytes]:
@@ -212,7 +225,7 @@ def publish(runs: Sequence[Path], into: Path) -> Numbers:
         numbers = merged(numbers, Numbers.of(analysis))
     numbers.write(into)
     published = Published(Numbers.read(into))
-    tables = {f"{table.name}.md": table for table in tables_of(published, analyses)}
+    tables = {f"{table.name}.md": table for table in tables_of(published, analyses, into)}
     for name, table in tables.items():
         write_atomically(into / name, table.to_markdown().encode())
     for path in into.glob("*.md"):

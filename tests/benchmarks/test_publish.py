@@ -111,10 +111,20 @@ def test_another_ground_leaves_out_all_that_was_published_of_a_dataset(script: M
     assert {row["variant"] for row in new.cells if row["dataset"] == "maze2d-umaze"} == set(ERRORS)
 
 
+def test_table_1_keeps_rows_of_methods_that_a_run_does_not_have(script: ModuleType, tmp_path: Path) -> None:
+    head, path = ("method", "test", "a"), tmp_path / "table-01-line.md"
+    former = (("NoAug. (none)", "paper", "1"), ("Jittering", "paper", "2"), ("Empirical result", "roll-outs", "3"))
+    path.write_text(script.Table("table-01-line", "Before", head, former).to_markdown())
+    now = script.Table("table-01-line", "Now", head, (("NoAug. (none)", "paper", "4"), ("SPAWNER", "paper", "5")))
+    found = script.with_former_rows(now, path)
+    assert (found.caption, found.rows) == ("Now", (now.rows[0], now.rows[1], former[1], former[2]))
+    assert script.with_former_rows(now, tmp_path / "nothing.md") == now
+
+
 def test_what_is_published_is_what_its_numbers_say(script: ModuleType) -> None:
     """Every committed table is that of the committed numbers; table 1 needs estimates and is left out."""
     published = script.Published(script.Numbers.read(PUBLISHED))
-    tables = script.tables_of(published, ())
+    tables = script.tables_of(published, (), PUBLISHED)
     assert len(tables) > 60
     for table in tables:
         assert (PUBLISHED / f"{table.name}.md").read_text() == table.to_markdown(), table.name
