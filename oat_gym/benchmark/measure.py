@@ -67,9 +67,17 @@ def environment(device: str) -> dict[str, Any]:
         "commit": commit(),
         "python": platform.python_version(),
         **versions,
-        "machine": f"{platform.system()} {platform.machine()} {torch.backends.cpu.get_cpu_capability()}",
+        "machine": f"{platform.system()} {platform.machine()} {processor()} {torch.backends.cpu.get_cpu_capability()}",
         "device": device_name(device),
     }
+
+
+def processor() -> str:
+    """Return what is known of the processor's maker, by which torch's MKL chooses its kernels."""
+    place = Path("/proc/cpuinfo")
+    lines = place.read_text().splitlines() if place.exists() else []
+    makers = (line.partition(":")[2].strip() for line in lines if line.startswith("vendor_id"))
+    return next(makers, platform.processor())
 
 
 def device_name(device: str) -> str:

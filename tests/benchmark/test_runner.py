@@ -11,6 +11,7 @@ import pytest
 
 from oat_gym import ope
 from oat_gym.benchmark import job as job_module
+from oat_gym.benchmark.measure import processor
 from oat_gym.benchmark.plan import Plan, make_plan, read_manifests, write_manifest
 from oat_gym.benchmark.protocol import SUITES, Question, Suite, find_suite
 from oat_gym.benchmark.results import read_results
@@ -65,6 +66,7 @@ def test_estimates_come_near_the_exact_values(finished: tuple[Plan, Path]) -> No
         assert result.record["cost"]["cpu_seconds"] >= 0
         assert result.record["cost"]["peak_memory_mb"] > 10
         assert result.record["environment"]["numpy"] == np.__version__
+        assert processor() in result.record["environment"]["machine"]
         assert result.record["config"]["estimator"]["class"] in ("FQE", "ImportanceSampling")
 
 
