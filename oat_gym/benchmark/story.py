@@ -232,15 +232,21 @@ def by_level(analysis: Analysis) -> Picture | None:
 def level_panels(
     analysis: Analysis, groups: Mapping[str, Sequence[str]]
 ) -> dict[str, dict[str, list[Improvement | None]]]:
-    """Return what `by_level` draws: metric -> variant -> its improvement on each level's datasets."""
+    """Return what `by_level` draws: metric -> variant -> its improvement on each level's datasets.
+
+    A variant that was not measured on all datasets of each level has their numbers behind its name.
+    """
     panels: dict[str, dict[str, list[Improvement | None]]] = {}
     for metric, title in METRICS.items():
-        changes = {
-            variant: [_change(analysis.over(names, variant, MEAN, metric)) for names in groups.values()]
-            for variant in analysis.results.variants
-            if variant != NONE
-        }
-        compared = {name: found for name, found in changes.items() if sum(each is not None for each in found) > 1}
+        compared: dict[str, list[Improvement | None]] = {}
+        for variant in analysis.results.variants:
+            found = [analysis.over(names, variant, MEAN, metric) for names in groups.values()]
+            if variant == NONE or sum(each is not None for each in found) < 2:
+                continue
+            numbers = [len(each.datasets) if each else 0 for each in found]
+            whole = numbers == [len(names) for names in groups.values()]
+            label = variant if whole else f"{variant} ({', '.join(map(str, numbers))} tasks)"
+            compared[label] = [each and each.improvement for each in found]
         if compared:
             panels[f"{title}: {UNITS[metric]}"] = compared
     return panels
@@ -250,10 +256,6 @@ def _level_label(level: str, names: Sequence[str]) -> str:
     """Return a level with its number of tasks, and how many of them stand in for the paper's data."""
     others = stand_ins_of(names)
     return f"{level}: {len(names)} of 4 tasks" + (f", {len(others)} of them stand-ins" if others else "")
-
-
-def _change(found: Finding | None) -> Improvement | None:
-    return None if found is None else found.improvement
 
 
 def coverage_picture(arrays: Arrays, value: Mapping[str, Any]) -> Picture:

@@ -371,7 +371,7 @@ def test_pictures_name_what_was_measured_on_some_datasets_only() -> None:
     assert all(panel.names == ["oat-paper", "jittering", "scaling (1 of 2)"] for panel in panels)
     names = {level: [name for name in levels if name.endswith(level)] for level in ("human", "expert")}
     found = level_panels(partial, names)  # jittering was tried at one level alone
-    assert found and all(list(panel) == ["oat-paper", "scaling"] for panel in found.values())
+    assert found and all(list(panel) == ["oat-paper", "scaling (1, 2 tasks)"] for panel in found.values())
     assert by_level(partial) is not None
     assert by_level(Analysis(results_of({"adroit-door-human": True}))) is None
 
