@@ -15,6 +15,7 @@ from oat_gym.benchmark.scores import METRICS, Draws, Metric, draw_scores, score
 from oat_gym.benchmark.store import CellResult
 from oat_gym.benchmark.variants import NONE
 from oat_gym.domains import TASKS
+from oat_gym.ope.intervals import bootstrap_interval
 
 FloatArray = npt.NDArray[np.float64]
 MEAN = "mean"
@@ -42,11 +43,30 @@ class Finding:
     baseline: str = NONE
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """What an estimator says of a policy: the mean over some seeds.
+
+    `low` and `high` are the ends of its 95% bootstrap interval over the recorded episodes, `deviation` is over the
+    seeds (NaN for one).
+    """
+
+    dataset: str
+    variant: str
+    family: str
+    policy: str
+    seeds: int
+    value: float
+    low: float
+    high: float
+    deviation: float
+
+
 @dataclass
 class Analysis:
     """Improvements of the cells of one setting, computed when asked for and kept.
 
-    Only datasets whose true values are known have any.
+    Only datasets whose true values are known have any; of the others there are `estimates`.
     """
 
     results: Results
@@ -68,6 +88,10 @@ class Analysis:
         """Return the datasets whose policies' true values are known."""
         return self._known
 
+    def without_truth(self) -> tuple[str, ...]:
+        """Return the datasets that have estimates and no true values."""
+        return tuple(name for name in self.results.datasets if name not in (*self.with_truth(), *self.failed()))
+
     def failed(self) -> tuple[str, ...]:
         """Return the datasets of which no cell was finished."""
         done = {cell.dataset for cell in self.results.cells if not cell.failed}
@@ -87,6 +111,15 @@ class Analysis:
         if cell is None or dataset not in self.results.recorded:
             return None
         return float(score(np.full(len(cell.true), self.results.recorded[dataset][0]), cell.true, "mae"))
+
+    def recorded(self, dataset: str) -> tuple[float, float] | None:
+        """Return the mean recorded return of a dataset and its standard error; None where unknown."""
+        return self.results.recorded.get(dataset)
+
+    def estimates(self, dataset: str) -> tuple[Estimate, ...]:
+        """Return the estimates of a dataset, by estimator, variant and policy."""
+        places = product(self.results.families, self.results.variants)
+        return tuple(each for family, variant in places for each in estimates_of(self.cells(dataset, variant, family)))
 
     def scores(
         self, dataset: str, variant: str, family: str, metric: Metric, *, seeds: Sequence[int] | None = None
@@ -189,6 +222,20 @@ class Analysis:
             values, replicates = np.stack([c.values for c in cells]), np.stack([c.replicates for c in cells])
             self._draws[key] = draw_scores(values, replicates, cells[0].true, cells[0].true_errors, metric)
         return self._draws[key]
+
+
+def estimates_of(cells: Sequence[CellResult]) -> tuple[Estimate, ...]:
+    """Return the estimates of each policy from the cells of one dataset, variant and estimator, of different seeds."""
+    if not cells:
+        return ()
+    first, values = cells[0], np.stack([cell.values for cell in cells])
+    draws = np.mean([cell.replicates for cell in cells], axis=0)
+    low, high = bootstrap_interval(draws, n=int(first.record["n_episodes"]))
+    deviation = values.std(axis=0, ddof=1) if len(cells) > 1 else np.full(values.shape[1], np.nan)
+    return tuple(
+        Estimate(first.dataset, first.variant, first.family, policy, len(cells), *map(float, numbers))
+        for policy, *numbers in zip(first.policies, values.mean(axis=0), low, high, deviation, strict=True)
+    )
 
 
 def _episodes_of(task: str) -> str:

@@ -18,6 +18,7 @@ import torch
 import oat_gym
 
 _LIBRARIES = ("numpy", "scipy", "scikit-learn", "torch", "gymnasium", "minari")
+_CPUINFO = Path("/proc/cpuinfo")
 
 
 @dataclass
@@ -72,10 +73,9 @@ def environment(device: str) -> dict[str, Any]:
     }
 
 
-def processor() -> str:
+def processor(cpuinfo: Path = _CPUINFO) -> str:
     """Return what is known of the processor's maker, by which torch's MKL chooses its kernels."""
-    place = Path("/proc/cpuinfo")
-    lines = place.read_text().splitlines() if place.exists() else []
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     makers = (line.partition(":")[2].strip() for line in lines if line.startswith("vendor_id"))
     return next(makers, platform.processor())
 

@@ -13,10 +13,12 @@ import jinja2
 
 from oat_gym.benchmark import story
 from oat_gym.benchmark.analysis import MEAN, Analysis
+from oat_gym.benchmark.captions import budget_lines
+from oat_gym.benchmark.estimates import estimates_table
 from oat_gym.benchmark.grid import format_number
 from oat_gym.benchmark.results import Results, read_results
 from oat_gym.benchmark.scores import METRICS
-from oat_gym.benchmark.tables import USES, all_tables, budget_lines, dataset_table
+from oat_gym.benchmark.tables import USES, all_tables, dataset_table
 from oat_gym.cache import Arrays, write_atomically
 
 TEMPLATE = "page.html.jinja"
@@ -120,11 +122,10 @@ def _dataset(analysis: Analysis, name: str) -> dict[str, Any]:
         "mined": _mined(made),
         "generated": [_generated(value) for _, value in _first_seeds(made) if value["synthetic"] is not None],
         "coverage": _coverage(made),
-        "table": dataset_table(analysis, name) if known else None,
+        "table": dataset_table(analysis, name) if known else estimates_table(analysis, name),
         "floor": story.floor_sentence(analysis, name),
         "truth_picture": story.truth_picture(analysis, name) if known else None,
         "returns": story.returns_picture(analysis, name) if known else None,
-        "estimates": [] if known else story.estimate_table(analysis, name),
         "agreement": next((story.agreement_picture(v) for _, v in made if v.get("agreement")), None),
         "families": _family_bars(analysis, name) if known else [],
     }

@@ -13,15 +13,15 @@ import numpy as np
 from oat_gym import plots
 from oat_gym.benchmark import figures, paper
 from oat_gym.benchmark.analysis import MEAN, Analysis, Finding
+from oat_gym.benchmark.captions import stand_ins_of
 from oat_gym.benchmark.figures import Panel
 from oat_gym.benchmark.grid import format_number
 from oat_gym.benchmark.improvement import Improvement
 from oat_gym.benchmark.scores import METRICS, Metric
-from oat_gym.benchmark.tables import adroit_dataset, stand_ins_of
+from oat_gym.benchmark.tables import adroit_dataset
 from oat_gym.benchmark.variants import NONE, VARIANTS
 from oat_gym.cache import Arrays
 from oat_gym.domains import maze2d
-from oat_gym.ope.intervals import bootstrap_interval
 
 UNITS: dict[Metric, str] = {
     "mae": "percent less error",
@@ -315,20 +315,3 @@ def agreement_picture(value: Mapping[str, Any]) -> Picture | None:
         " It compares people and not policies: those treated differently may have been in another state to begin with."
     )
     return Picture.of(figures.agreement_curves(told["curves"], event=told["event"], title=title), caption)
-
-
-def estimate_table(analysis: Analysis, dataset: str) -> list[dict[str, Any]]:
-    """Return estimates with intervals by policy, estimator and variant, for a dataset without true values."""
-    rows: list[dict[str, Any]] = []
-    for family in analysis.results.families:
-        for variant in analysis.results.variants:
-            cells = analysis.cells(dataset, variant, family)
-            if not cells:
-                continue
-            values = np.mean([cell.values for cell in cells], axis=0)
-            draws = np.mean([cell.replicates for cell in cells], axis=0)
-            low, high = bootstrap_interval(draws, n=int(cells[0].record["n_episodes"]))
-            for p, policy in enumerate(cells[0].policies):
-                texts = [format_number(float(number[p])) for number in (values, low, high)]
-                rows.append({"estimator": family, "variant": variant, "policy": policy, "numbers": texts})
-    return rows

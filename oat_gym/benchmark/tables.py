@@ -9,8 +9,9 @@ import numpy as np
 
 from oat_gym.benchmark import paper
 from oat_gym.benchmark.analysis import MEAN, RIVALRY, RIVALS, Analysis, Finding
+from oat_gym.benchmark.captions import notes
+from oat_gym.benchmark.estimates import estimates_table
 from oat_gym.benchmark.grid import Table, format_number
-from oat_gym.benchmark.results import Results
 from oat_gym.benchmark.scores import METRICS, Metric
 from oat_gym.benchmark.variants import NONE, VARIANTS
 from oat_gym.ope import metrics as ope_metrics
@@ -41,6 +42,7 @@ def all_tables(analysis: Analysis) -> tuple[Table, ...]:
         for metric in RIVALRY
         for baseline in RIVALS
     ]
+    made += [estimates_table(analysis, dataset) for dataset in analysis.without_truth()]
     made += [overview_table(analysis, metric, baseline=name) for metric in RIVALRY for name in (NONE, *RIVALS)]
     return tuple(table for table in made if table is not None)
 
@@ -64,7 +66,7 @@ def paper_table(analysis: Analysis, level: str, metric: Metric) -> Table | None:
     ]
     number = paper.TABLES[level, metric]
     header = ("estimator", "method", *(text for task in paper.TASKS for text in (task, "paper")))
-    caption = f"Table {number}. {METRICS[metric].capitalize()}, Adroit {level}. {_notes(analysis, datasets)}"
+    caption = f"Table {number}. {METRICS[metric].capitalize()}, Adroit {level}. {notes(analysis, datasets)}"
     return Table(f"table-{number:02d}", caption, header, tuple(rows))
 
 
@@ -85,7 +87,7 @@ def table_2(analysis: Analysis) -> Table | None:
             ]
             rows.append((task, method_name(variant), *cells))
     header = ("task", "method", *(text for name in METRICS.values() for text in (name, "paper")))
-    caption = f"Table 2. Averages over the estimators, Adroit human. {_notes(analysis, datasets)}"
+    caption = f"Table 2. Averages over the estimators, Adroit human. {notes(analysis, datasets)}"
     return Table("table-02", caption, header, tuple(rows))
 
 
@@ -104,7 +106,7 @@ def dataset_table(analysis: Analysis, dataset: str) -> Table:
     floor = analysis.floor(dataset)
     if floor is not None:
         rows.append((FLOOR, NONE, format_number(floor), *("-" for _ in list(METRICS)[1:])))
-    caption = f"All metrics of {dataset}. {_notes(analysis, {dataset: dataset})}"
+    caption = f"All metrics of {dataset}. {notes(analysis, {dataset: dataset})}"
     return Table(f"dataset-{dataset}", caption, ("estimator", "variant", *METRICS.values()), tuple(rows))
 
 
@@ -128,7 +130,7 @@ def help_table(analysis: Analysis, dataset: str, metric: Metric, *, baseline: st
     caption = (
         f"{question} on {dataset}? Improvement of the {METRICS[metric]} over {other} ({unit}, positive is "
         f"better), 95% interval and verdict; of FQE and MB from given starts it is for these recorded episodes. "
-        f"{_notes(analysis, {dataset: dataset}, signs=False)}{'' if plain else f' {USES}'}"
+        f"{notes(analysis, {dataset: dataset}, signs=False)}{'' if plain else f' {USES}'}"
     )
     name = f"helped-{metric}-{dataset}" if plain else f"against-{baseline}-{metric}-{dataset}"
     return Table(name, caption, ("variant", "seeds", *columns), tuple(rows))
@@ -306,38 +308,3 @@ def method_name(variant: str) -> str:
     """Return a variant's name, with the paper's where it repeats a row of its tables."""
     row = VARIANTS[variant].paper if variant in VARIANTS else ""
     return f"{row} ({variant})" if row and row.lower() != variant else row or variant
-
-
-def _notes(analysis: Analysis, datasets: dict[str, str | None], *, signs: bool = True) -> str:
-    """Return what a caption must say: seeds, setting, budget, stand-ins, and what means and `SIGNS` are."""
-    there = [name for name in datasets.values() if name is not None]
-    seeds = _fewest_seeds(analysis, there)
-    most = max(seeds.values(), default=0)
-    fewer = ", ".join(f"{count} for {name}" for name, count in seeds.items() if count < most)
-    text = f"{most} seeds{f' ({fewer})' if fewer else ''}{', mean ± standard deviation' if signs else ''}; "
-    text += "rows of other seeds are compared by the seeds that they share; " if signs and fewer else ""
-    text += f"{analysis.results.setting.describe()}; {'; '.join(budget_lines(analysis.results))}."
-    text += " + or - : better or worse than no augmentation, 95% interval excludes zero." if signs else ""
-    stand_ins = stand_ins_of(there)
-    return text + (f" Stand-ins, not the paper's data: {', '.join(stand_ins)}." if stand_ins else "")
-
-
-def _fewest_seeds(analysis: Analysis, datasets: Sequence[str]) -> dict[str, int]:
-    """Return the number of seeds of each variant, on that of its datasets where it has the fewest."""
-    counts: dict[str, dict[str, set[int]]] = {}
-    for cell in analysis.results.cells:
-        if cell.dataset in datasets and not cell.failed:
-            counts.setdefault(cell.variant, {}).setdefault(cell.dataset, set()).add(cell.seed)
-    return {name: min(map(len, found.values())) for name, found in counts.items()}
-
-
-def budget_lines(results: Results) -> list[str]:
-    """Return what the budgets of the runs that gave the cells were."""
-    there = {cell.record["fingerprint"] for cell in results.cells}
-    made = [manifest for manifest in results.manifests if there & set(manifest["cells"].values())]
-    return sorted({manifest["budget_line"] for manifest in made})
-
-
-def stand_ins_of(datasets: Sequence[str]) -> list[str]:
-    """Return the datasets that stand in for the paper's: cloned from an expert's roll-outs, not from people's."""
-    return [name for name in datasets if name.endswith("-from-expert")]

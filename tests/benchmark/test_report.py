@@ -13,6 +13,7 @@ import pytest
 
 from oat_gym.benchmark import figures, paper
 from oat_gym.benchmark.analysis import Analysis
+from oat_gym.benchmark.estimates import estimates_table
 from oat_gym.benchmark.grid import write_tables
 from oat_gym.benchmark.improvement import Parts
 from oat_gym.benchmark.page import make_page
@@ -99,6 +100,34 @@ def test_verdicts_follow_the_errors(analysis: Analysis) -> None:
     worse = sentence(verdicts["scaling"], of="scaling")
     numbers = [float(part) for part in re.findall(r"-?\d+(?:\.\d+)?", worse.split("%", 1)[1].replace("95%", ""))]
     assert "raises the error by 120%" in worse and numbers[0] < 120 < numbers[1]  # the interval is of the same sign
+
+
+def test_estimates_are_told_where_nobody_knows_the_truth(analysis: Analysis) -> None:
+    table = estimates_table(analysis, "logs")
+    assert table is not None and table.header == (
+        "estimator",
+        "variant",
+        *POLICIES[:6],
+        "expert",
+        "moved by",
+        "order kept",
+    )
+    assert [row[:2] for row in table.rows] == [(family, name) for family in ("FQE", "IS") for name in ERRORS]
+    assert "Nobody" not in table.caption and "return 250 on average (standard error 20)" in table.caption
+    rows = {row[:2]: row for row in table.rows}
+    assert rows["FQE", "none"][-2:] == ("-", "-")
+    moved = {name: float(rows["IS", name][-2]) for name in ERRORS if name != "none"}
+    assert moved == pytest.approx({"oat-paper": 60, "jittering": 0, "scaling": 120}, abs=2)
+    assert {row[-1] for row in table.rows if row[1] != "none"} == {"1.00"}  # errors that all policies share
+    values = [part.values for part in analysis.cells("logs", "scaling", "IS")]
+    assert rows["IS", "scaling"][2].startswith(f"{np.mean(values, axis=0)[0]:.0f} (")
+    found = {(each.family, each.variant, each.policy): each for each in analysis.estimates("logs")}
+    one = found["IS", "scaling", "p0"]
+    assert one.low < one.value < one.high and one.seeds == 3
+    assert one.deviation == pytest.approx(np.std([part[0] for part in values], ddof=1))
+    assert estimates_table(analysis, "elsewhere") is None
+    names = {table.name for table in all_tables(analysis)}
+    assert "estimates-logs" in names and "estimates-adroit-door-human" not in names
 
 
 def test_a_variant_that_was_not_tried_on_a_dataset_has_no_row_there() -> None:
@@ -333,6 +362,7 @@ def test_the_page_says_it_all_and_loads_nothing(analysis: Analysis) -> None:
     assert "minari download D4RL/pen/human-v2" in page
     assert "No error can be computed here" in page
     assert "Nobody knows." in page
+    assert "order kept" in page
     assert "&lt;diverged&gt;" in page  # what cells say is text, never markup
     for word in ("helps", "hurts", "no evidence"):
         assert word in page

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import logging
+import platform
 import shutil
 from pathlib import Path
 
@@ -54,6 +55,14 @@ def finished(computed: tuple[Plan, Path], tmp_path: Path) -> tuple[Plan, Path]:
     """A finished run that a test may change."""
     shutil.copytree(computed[1], tmp_path / "one")
     return computed[0], tmp_path / "one"
+
+
+def test_the_maker_of_the_processor_is_read_from_the_kernels_list(tmp_path: Path) -> None:
+    listed = tmp_path / "cpuinfo"
+    listed.write_text("processor\t: 0\nvendor_id\t: GenuineIntel\n\nprocessor\t: 1\nvendor_id\t: GenuineIntel\n")
+    assert processor(listed) == "GenuineIntel"
+    listed.write_text("processor\t: 0\nCPU implementer\t: 0x41\n")  # ARM's lists have no maker's name
+    assert processor(listed) == processor(tmp_path / "absent") == platform.processor()
 
 
 def test_estimates_come_near_the_exact_values(finished: tuple[Plan, Path]) -> None:

@@ -22,14 +22,15 @@ import base64
 import csv
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from oat_gym.benchmark import story
-from oat_gym.benchmark.analysis import Analysis, Finding
+from oat_gym.benchmark.analysis import Analysis, Estimate, Finding
 from oat_gym.benchmark.budget import BUDGETS
 from oat_gym.benchmark.grid import Table
 from oat_gym.benchmark.protocol import SUITES, Question
@@ -43,18 +44,19 @@ from oat_gym.cache import write_atomically
 
 SETTING = Setting("standard", Question())
 DATASETS = tuple(dict.fromkeys(name for suite in SUITES.values() for name in suite.datasets))
-FILES = ("cells", "improvements", "recorded")
-KEPT = ("dataset-", "helped-mae-", "helped-rank_correlation-", "against-oat-mae-", "overview-", "table-")
+FILES = ("cells", "improvements", "estimates", "recorded")
+KEPT = ("dataset-", "estimates-", "helped-mae-", "helped-rank_correlation-", "against-oat-mae-", "overview-", "table-")
 """How the names of the tables that are published begin."""
 _EMPTY = np.empty(0)
 
 
 @dataclass(frozen=True)
 class Numbers:
-    """The rows of the three files."""
+    """The rows of the four files."""
 
     cells: tuple[Row, ...]
     improvements: tuple[Row, ...]
+    estimates: tuple[Row, ...]
     recorded: tuple[Row, ...]
 
     @classmethod
@@ -66,18 +68,23 @@ class Numbers:
     def of(cls, analysis: Analysis) -> Numbers:
         """Return the rows of a run, without cells that failed."""
         recorded: list[Row] = []
-        for name in analysis.with_truth():
-            floor = analysis.floor(name)
-            if floor is not None:
-                mean, error = analysis.results.recorded[name]
-                recorded.append({"dataset": name, "mean": mean, "standard_error": error, "mae": floor})
+        for name in (*analysis.with_truth(), *analysis.without_truth()):
+            log = analysis.recorded(name)
+            if log is not None:
+                mae = analysis.floor(name)
+                recorded.append({"dataset": name, "mean": log[0], "standard_error": log[1], "mae": mae})
+        estimates = [asdict(each) for name in analysis.without_truth() for each in analysis.estimates(name)]
         cells = [row for row in cell_rows(analysis.results) if not row["reason"]]
-        return cls(*(_texts(rows) for rows in (cells, improvement_rows(analysis), recorded)))
+        return cls(*(_texts(rows) for rows in (cells, improvement_rows(analysis), estimates, recorded)))
 
     def write(self, folder: Path) -> None:
-        """Write the three files."""
+        """Write the files; none without rows."""
         for name in FILES:
-            write_atomically(folder / f"{name}.csv", to_csv(_sorted(getattr(self, name))).encode())
+            rows, path = _sorted(getattr(self, name)), folder / f"{name}.csv"
+            if rows:
+                write_atomically(path, to_csv(rows).encode())
+            else:
+                path.unlink(missing_ok=True)
 
 
 def merged(old: Numbers, new: Numbers) -> Numbers:
@@ -107,6 +114,7 @@ def merged(old: Numbers, new: Numbers) -> Numbers:
     return Numbers(
         cells=(*kept(old.cells), *fresh(new.cells)),
         improvements=(*standing, *fresh(new.improvements), *more_pairs),
+        estimates=(*kept(old.estimates), *fresh(new.estimates)),
         recorded=tuple(recorded.values()),
     )
 
@@ -131,7 +139,8 @@ class Published(Analysis):
     """Published numbers in the place of cells: what tables and pictures of bars need to know."""
 
     def __init__(self, numbers: Numbers) -> None:
-        self._floors = {row["dataset"]: float(row["mae"]) for row in numbers.recorded}
+        self._recorded = {row["dataset"]: row for row in numbers.recorded}
+        self._estimates = [estimate_of(row) for row in numbers.estimates]
         super().__init__(_results(numbers.cells))
         found = [improvement_of(row) for row in numbers.improvements]
         self._known = tuple(name for name in self.results.datasets if name in {each.datasets[0] for each in found})
@@ -152,15 +161,43 @@ class Published(Analysis):
         """Return a published metric of each seed."""
         there = [cell.seed for cell in super().cells(dataset, variant, family)] if seeds is None else seeds
         texts = [self._scores[dataset, variant, family, seed][metric] for seed in there]
-        return np.array([float(text) if text != "" else math.nan for text in texts])
+        return np.array([_number(text) for text in texts])
 
     def floor(self, dataset: str) -> float | None:
         """Return the published error of the mean recorded return."""
-        return self._floors.get(dataset)
+        mae = self._recorded.get(dataset, {}).get("mae", "")
+        return None if mae == "" else float(mae)
+
+    def recorded(self, dataset: str) -> tuple[float, float] | None:
+        """Return the published mean recorded return and its standard error."""
+        row = self._recorded.get(dataset)
+        return None if row is None else (float(row["mean"]), float(row["standard_error"]))
+
+    def without_truth(self) -> tuple[str, ...]:
+        """Return the datasets whose estimates are published."""
+        there = {each.dataset for each in self._estimates}
+        return tuple(name for name in self.results.datasets if name in there)
+
+    def estimates(self, dataset: str) -> tuple[Estimate, ...]:
+        """Return the published estimates, by estimator, variant and policy."""
+        places = product(self.results.families, self.results.variants)
+        own = [each for each in self._estimates if each.dataset == dataset]
+        return tuple(each for place in places for each in own if (each.family, each.variant) == place)
 
     def cells(self, dataset: str, variant: str, family: str) -> tuple[CellResult, ...]:
-        """Return nothing: estimates are not published."""
+        """Return nothing: cells are not published."""
         return ()
+
+
+def estimate_of(row: Row) -> Estimate:
+    """Return what a row of estimates says."""
+    value, low, high, deviation = (_number(row[name]) for name in ("value", "low", "high", "deviation"))
+    dataset, variant, family, policy = (row[name] for name in ("dataset", "variant", "family", "policy"))
+    return Estimate(dataset, variant, family, policy, int(row["seeds"]), value, low, high, deviation)
+
+
+def _number(text: str) -> float:
+    return math.nan if text == "" else float(text)
 
 
 def _results(rows: Iterable[Row]) -> Results:

@@ -14,7 +14,12 @@ from oat_gym.benchmark.store import CellResult
 from oat_gym.benchmark.tables import all_tables
 from tests.benchmark.test_report import ERRORS, cell, results_of
 
-DATASETS = {"adroit-door-human": True, "maze2d-umaze": True, "maze2d-umaze-d4rl": True}
+DATASETS = {
+    "adroit-door-human": True,
+    "maze2d-umaze": True,
+    "maze2d-umaze-d4rl": True,
+    "tutoring-smartprimer": False,
+}
 PUBLISHED = Path(__file__).parent / "results" / "benchmark"
 
 
@@ -56,6 +61,7 @@ def test_tables_of_published_numbers_are_those_of_the_cells(script: ModuleType, 
     for name, table in found.items():
         assert table.header == expected[name].header
         assert sorted(table.rows) == sorted(expected[name].rows), name
+    assert "estimates-tutoring-smartprimer" in found
 
 
 def test_a_run_adds_its_variants_and_leaves_the_others(script: ModuleType) -> None:

@@ -1,0 +1,43 @@
+"""What captions must say: seeds, setting, budget, stand-ins for the paper's data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from oat_gym.benchmark.analysis import Analysis
+from oat_gym.benchmark.results import Results
+
+
+def notes(analysis: Analysis, datasets: Mapping[str, str | None], *, signs: bool = True) -> str:
+    """Return what a caption must say: seeds, setting, budget, stand-ins, and what means and `SIGNS` are."""
+    there = [name for name in datasets.values() if name is not None]
+    seeds = fewest_seeds(analysis, there)
+    most = max(seeds.values(), default=0)
+    fewer = ", ".join(f"{count} for {name}" for name, count in seeds.items() if count < most)
+    text = f"{most} seeds{f' ({fewer})' if fewer else ''}{', mean ± standard deviation' if signs else ''}; "
+    text += "rows of other seeds are compared by the seeds that they share; " if signs and fewer else ""
+    text += f"{analysis.results.setting.describe()}; {'; '.join(budget_lines(analysis.results))}."
+    text += " + or - : better or worse than no augmentation, 95% interval excludes zero." if signs else ""
+    stand_ins = stand_ins_of(there)
+    return text + (f" Stand-ins, not the paper's data: {', '.join(stand_ins)}." if stand_ins else "")
+
+
+def fewest_seeds(analysis: Analysis, datasets: Sequence[str]) -> dict[str, int]:
+    """Return the number of seeds of each variant, on that of its datasets where it has the fewest."""
+    counts: dict[str, dict[str, set[int]]] = {}
+    for cell in analysis.results.cells:
+        if cell.dataset in datasets and not cell.failed:
+            counts.setdefault(cell.variant, {}).setdefault(cell.dataset, set()).add(cell.seed)
+    return {name: min(map(len, found.values())) for name, found in counts.items()}
+
+
+def budget_lines(results: Results) -> list[str]:
+    """Return what the budgets of the runs that gave the cells were."""
+    there = {cell.record["fingerprint"] for cell in results.cells}
+    made = [manifest for manifest in results.manifests if there & set(manifest["cells"].values())]
+    return sorted({manifest["budget_line"] for manifest in made})
+
+
+def stand_ins_of(datasets: Sequence[str]) -> list[str]:
+    """Return the datasets that stand in for the paper's: cloned from an expert's roll-outs, not from people's."""
+    return [name for name in datasets if name.endswith("-from-expert")]
