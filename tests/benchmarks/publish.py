@@ -170,8 +170,8 @@ class Published(Analysis):
 
     def recorded(self, dataset: str) -> tuple[float, float] | None:
         """Return the published mean recorded return and its standard error."""
-        row = self._recorded.get(dataset)
-        return None if row is None else (float(row["mean"]), float(row["standard_error"]))
+        row = self._recorded.get(dataset, {"mean": ""})
+        return None if row["mean"] == "" else (float(row["mean"]), float(row["standard_error"]))
 
     def without_truth(self) -> tuple[str, ...]:
         """Return the datasets whose estimates are published."""
