@@ -11,7 +11,8 @@ A run's rows of a variant on a dataset replace the published ones where these ar
 configuration. An improvement is of the run that computed the variant, over the same run's cells without augmentation.
 Where these are of another configuration than the published ones (other data, starts, estimators, versions of numpy or
 torch), everything published of that dataset is left out first. A run that computes published variants anew, the same
-seeds and configurations, adds improvements over a baseline that they were not compared with. Only cells of the budget
+seeds and configurations, adds improvements over a baseline that they were not compared with, and estimates that were
+not published. Only cells of the budget
 "standard" from reset starts are published.
 """
 
@@ -110,11 +111,14 @@ def merged(old: Numbers, new: Numbers) -> Numbers:
         if _comparison(row) not in compared
         and {(row["dataset"], row["variant"]), (row["dataset"], row["baseline"])} <= same
     ]
+    estimates = (*kept(old.estimates), *fresh(new.estimates))
+    told = {(row["dataset"], row["variant"]) for row in estimates}
+    untold = [row for row in new.estimates if (row["dataset"], row["variant"]) in same - told]
     recorded = {row["dataset"]: row for row in (*old.recorded, *new.recorded)}
     return Numbers(
         cells=(*kept(old.cells), *fresh(new.cells)),
         improvements=(*standing, *fresh(new.improvements), *more_pairs),
-        estimates=(*kept(old.estimates), *fresh(new.estimates)),
+        estimates=(*estimates, *untold),
         recorded=tuple(recorded.values()),
     )
 

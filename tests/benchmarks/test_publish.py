@@ -90,6 +90,18 @@ def test_a_run_of_published_variants_adds_comparisons_that_were_not_there(script
     assert script.merged(old, script.Numbers.of(only(two_seeds, "oat-paper", "none", "jittering"))) == old
 
 
+def test_a_run_of_published_variants_adds_estimates_that_were_not_there(script: ModuleType) -> None:
+    whole = Analysis(results_of({"tutoring-smartprimer": False}))
+    numbers = script.Numbers.of(whole)
+    bare = dataclasses.replace(numbers, estimates=())
+    assert {row["variant"] for row in numbers.estimates} == set(ERRORS)
+    more = script.merged(bare, script.Numbers.of(only(whole, "none", "scaling")))
+    assert {row["variant"] for row in more.estimates} == {"none", "scaling"}
+    assert len(script.merged(more, numbers).estimates) == len(numbers.estimates)
+    fewer = Analysis(dataclasses.replace(whole.results, cells=tuple(c for c in whole.results.cells if c.seed > 0)))
+    assert script.merged(bare, script.Numbers.of(fewer)).estimates == ()
+
+
 def test_more_seeds_and_other_settings_replace_what_is_published(script: ModuleType) -> None:
     whole = Analysis(results_of({"adroit-door-human": True}))
     old = script.Numbers.of(whole)
