@@ -48,7 +48,8 @@ class Estimate:
     """What an estimator says of a policy: the mean over some seeds.
 
     `low` and `high` are the ends of its 95% bootstrap interval over the recorded episodes, `deviation` is over the
-    seeds (NaN for one).
+    seeds (NaN for one). `change` is the mean over the seeds that both have of what it differs by from the estimate
+    without augmentation (NaN where there are none).
     """
 
     dataset: str
@@ -60,6 +61,7 @@ class Estimate:
     low: float
     high: float
     deviation: float
+    change: float
 
 
 @dataclass
@@ -107,19 +109,23 @@ class Analysis:
 
         An estimator that is further off tells less than the log's own average.
         """
-        cell = next((cell for cell in self.results.cells if cell.dataset == dataset and cell.knows_truth), None)
-        if cell is None or dataset not in self.results.recorded:
+        done = (cell for cell in self.results.cells if cell.dataset == dataset and not cell.failed and cell.knows_truth)
+        cell, log = next(done, None), self.recorded(dataset)
+        if cell is None or log is None:
             return None
-        return float(score(np.full(len(cell.true), self.results.recorded[dataset][0]), cell.true, "mae"))
+        return float(score(np.full(len(cell.true), log[0]), cell.true, "mae"))
 
     def recorded(self, dataset: str) -> tuple[float, float] | None:
-        """Return the mean recorded return of a dataset and its standard error; None where unknown."""
+        """Return the mean recorded return of a dataset, discounted, and its standard error; None where unknown."""
         return self.results.recorded.get(dataset)
 
     def estimates(self, dataset: str) -> tuple[Estimate, ...]:
         """Return the estimates of a dataset, by estimator, variant and policy."""
-        places = product(self.results.families, self.results.variants)
-        return tuple(each for family, variant in places for each in estimates_of(self.cells(dataset, variant, family)))
+        return tuple(
+            each
+            for family, variant in product(self.results.families, self.results.variants)
+            for each in estimates_of(self.cells(dataset, variant, family), self.cells(dataset, NONE, family))
+        )
 
     def scores(
         self, dataset: str, variant: str, family: str, metric: Metric, *, seeds: Sequence[int] | None = None
@@ -224,17 +230,24 @@ class Analysis:
         return self._draws[key]
 
 
-def estimates_of(cells: Sequence[CellResult]) -> tuple[Estimate, ...]:
-    """Return the estimates of each policy from the cells of one dataset, variant and estimator, of different seeds."""
+def estimates_of(cells: Sequence[CellResult], before: Sequence[CellResult]) -> tuple[Estimate, ...]:
+    """Return the estimates of each policy from the cells of one dataset, variant and estimator, of different seeds.
+
+    `before` are those without augmentation.
+    """
     if not cells:
         return ()
     first, values = cells[0], np.stack([cell.values for cell in cells])
     draws = np.mean([cell.replicates for cell in cells], axis=0)
     low, high = bootstrap_interval(draws, n=int(first.record["n_episodes"]))
     deviation = values.std(axis=0, ddof=1) if len(cells) > 1 else np.full(values.shape[1], np.nan)
+    then = {cell.seed: cell.values for cell in before}
+    changes = [cell.values - then[cell.seed] for cell in cells if cell.seed in then and cell.variant != NONE]
+    change = np.mean(changes, axis=0) if changes else np.full(values.shape[1], np.nan)
+    columns = (values.mean(axis=0), low, high, deviation, change)
     return tuple(
         Estimate(first.dataset, first.variant, first.family, policy, len(cells), *map(float, numbers))
-        for policy, *numbers in zip(first.policies, values.mean(axis=0), low, high, deviation, strict=True)
+        for policy, *numbers in zip(first.policies, *columns, strict=True)
     )
 
 

@@ -7,19 +7,31 @@ from collections.abc import Mapping, Sequence
 from oat_gym.benchmark.analysis import Analysis
 from oat_gym.benchmark.results import Results
 
+USES = (
+    "oat and its forms use synthetic episodes for training alone, the paper's methods for every estimator: IS with "
+    "the former sees the recorded episodes alone."
+)
+"""What must be known where means over the estimators are compared."""
+
 
 def notes(analysis: Analysis, datasets: Mapping[str, str | None], *, signs: bool = True) -> str:
     """Return what a caption must say: seeds, setting, budget, stand-ins, and what means and `SIGNS` are."""
     there = [name for name in datasets.values() if name is not None]
-    seeds = fewest_seeds(analysis, there)
-    most = max(seeds.values(), default=0)
-    fewer = ", ".join(f"{count} for {name}" for name, count in seeds.items() if count < most)
-    text = f"{most} seeds{f' ({fewer})' if fewer else ''}{', mean ± standard deviation' if signs else ''}; "
+    told, fewer = seed_numbers(analysis, there)
+    text = f"{told}{', mean ± standard deviation' if signs else ''}; "
     text += "rows of other seeds are compared by the seeds that they share; " if signs and fewer else ""
     text += f"{analysis.results.setting.describe()}; {'; '.join(budget_lines(analysis.results))}."
     text += " + or - : better or worse than no augmentation, 95% interval excludes zero." if signs else ""
     stand_ins = stand_ins_of(there)
     return text + (f" Stand-ins, not the paper's data: {', '.join(stand_ins)}." if stand_ins else "")
+
+
+def seed_numbers(analysis: Analysis, datasets: Sequence[str]) -> tuple[str, bool]:
+    """Return how many seeds there are and which variants have fewer, in words, and whether any has."""
+    seeds = fewest_seeds(analysis, datasets)
+    most = max(seeds.values(), default=0)
+    fewer = ", ".join(f"{count} for {name}" for name, count in seeds.items() if count < most)
+    return f"{most} seeds{f' ({fewer})' if fewer else ''}", bool(fewer)
 
 
 def fewest_seeds(analysis: Analysis, datasets: Sequence[str]) -> dict[str, int]:

@@ -13,12 +13,12 @@ import jinja2
 
 from oat_gym.benchmark import story
 from oat_gym.benchmark.analysis import MEAN, Analysis
-from oat_gym.benchmark.captions import budget_lines
+from oat_gym.benchmark.captions import USES, budget_lines
 from oat_gym.benchmark.estimates import estimates_table
 from oat_gym.benchmark.grid import format_number
 from oat_gym.benchmark.results import Results, read_results
 from oat_gym.benchmark.scores import METRICS
-from oat_gym.benchmark.tables import USES, all_tables, dataset_table
+from oat_gym.benchmark.tables import all_tables, dataset_table
 from oat_gym.cache import Arrays, write_atomically
 
 TEMPLATE = "page.html.jinja"

@@ -107,15 +107,15 @@ def summary_rows(analysis: Analysis, group: Group) -> list[dict[str, Any]]:
 
 def floor_sentence(analysis: Analysis, dataset: str) -> str:
     """Return how far off the log's own average is, and which estimators are further off without augmentation; or ""."""
-    floor = analysis.floor(dataset)
-    if floor is None:
+    floor, log = analysis.floor(dataset), analysis.recorded(dataset)
+    if floor is None or log is None:
         return ""
-    mean, error = analysis.results.recorded[dataset]
+    mean, error = log
     errors = {name: analysis.scores(dataset, NONE, name, "mae") for name in analysis.results.families}
     measured = {name: float(found.mean()) for name, found in errors.items() if len(found)}
     worse = [name for name, off in measured.items() if off > floor]
-    told = f"The recorded episodes return {format_number(mean)} on average (standard error {format_number(error)})."
-    told += f" Said of every policy, that is off by {format_number(floor)}"
+    told = f"The recorded episodes return {format_number(mean)} on average, discounted (standard error "
+    told += f"{format_number(error)}). Said of every policy, that is off by {format_number(floor)}"
     if worse:
         return f"{told}; further off without augmentation: {', '.join(worse)}."
     return f"{told}, further than every estimator without augmentation." if measured else f"{told}."

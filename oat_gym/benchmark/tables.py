@@ -9,7 +9,7 @@ import numpy as np
 
 from oat_gym.benchmark import paper
 from oat_gym.benchmark.analysis import MEAN, RIVALRY, RIVALS, Analysis, Finding
-from oat_gym.benchmark.captions import notes
+from oat_gym.benchmark.captions import USES, notes
 from oat_gym.benchmark.estimates import estimates_table
 from oat_gym.benchmark.grid import Table, format_number
 from oat_gym.benchmark.scores import METRICS, Metric
@@ -18,11 +18,6 @@ from oat_gym.ope import metrics as ope_metrics
 
 SIGNS = {"helps": "+", "hurts": "-", "no evidence": "", "not measured": ""}
 """What stands behind a number that differs from no augmentation with an interval that excludes zero."""
-USES = (
-    "oat and its forms use synthetic episodes for training alone, the paper's methods for every estimator: IS with "
-    "the former sees the recorded episodes alone."
-)
-"""What must be known where means over the estimators are compared."""
 FLOOR = "mean recorded return"
 """In the place of an estimator: the log's own average, said of every policy."""
 EXPERT = "expert"
@@ -121,7 +116,7 @@ def help_table(analysis: Analysis, dataset: str, metric: Metric, *, baseline: st
         found = [analysis.finding(dataset, variant, name, metric, baseline=baseline) for name in columns]
         if any(each is not None for each in found):
             seeds = max(each.improvement.n_seeds for each in found if each is not None)
-            rows.append((variant, str(seeds), *(_verdict_text(each) for each in found)))
+            rows.append((variant, str(seeds), *(_verdict_text(each, len(analysis.results.families)) for each in found)))
     if not rows:
         return None
     unit = "percent less error" if metric == "mae" else "in its own unit"
@@ -149,11 +144,12 @@ def overview_table(analysis: Analysis, metric: Metric, *, baseline: str = NONE) 
         verdicts = [each.improvement.verdict for each in found if each is not None and each.improvement.n_seeds > 1]
         counts = [f"{verdicts.count(verdict)} of {len(verdicts)}" for verdict in ("helps", "hurts")]
         if any(each is not None for each in found):
+            families = len(analysis.results.families)
             whole = [
-                _verdict_text(analysis.over_all(variant, MEAN, metric, baseline=baseline, between=between))
+                _verdict_text(analysis.over_all(variant, MEAN, metric, baseline=baseline, between=between), families)
                 for between in (False, True)
             ]
-            rows.append((variant, *whole, *counts, *(_overview_text(each) for each in found)))
+            rows.append((variant, *whole, *counts, *(_overview_text(each, families) for each in found)))
     if len(datasets) < 2 or not rows:
         return None
     unit, plain = "percent less error" if metric == "mae" else "in its own unit", baseline == NONE
@@ -169,22 +165,24 @@ def overview_table(analysis: Analysis, metric: Metric, *, baseline: str = NONE) 
     return Table(name, caption, ("variant", "over all", "another task", *words, *datasets), tuple(rows))
 
 
-def _overview_text(found: Finding | None) -> str:
+def _overview_text(found: Finding | None, families: int) -> str:
     if found is not None and found.improvement.n_seeds == 1 and math.isfinite(found.improvement.value):
         return f"{format_number(found.improvement.value)} (one seed)"
-    return _verdict_text(found)
+    return _verdict_text(found, families)
 
 
-def _verdict_text(found: Finding | None) -> str:
+def _verdict_text(found: Finding | None, families: int) -> str:
+    """Return an improvement, its interval and the verdict; a mean of fewer than all `families` is said to be so."""
     if found is None or not math.isfinite(found.improvement.value):
         return "-"
-    change = found.improvement
+    change, number = found.improvement, len(found.families)
+    of = f" [{number} of {families} estimators]" if found.family == MEAN and number < families else ""
     numbers = [format_number(number) for number in (change.value, change.low, change.high)]
     if not math.isfinite(change.low):
-        return f"{numbers[0]} (no interval)"
+        return f"{numbers[0]} (no interval){of}"
     words = ("helps", "hurts") if found.baseline == NONE else ("better", "worse")
     word = {"helps": f" {words[0]}", "hurts": f" {words[1]}"}.get(change.verdict, "")
-    return f"{numbers[0]} ({numbers[1]} to {numbers[2]}){word}"
+    return f"{numbers[0]} ({numbers[1]} to {numbers[2]}){word}{of}"
 
 
 def table_1(analysis: Analysis, dataset: str) -> Table | None:

@@ -104,16 +104,12 @@ def test_verdicts_follow_the_errors(analysis: Analysis) -> None:
 
 def test_estimates_are_told_where_nobody_knows_the_truth(analysis: Analysis) -> None:
     table = estimates_table(analysis, "logs")
-    assert table is not None and table.header == (
-        "estimator",
-        "variant",
-        *POLICIES[:6],
-        "expert",
-        "moved by",
-        "order kept",
-    )
+    assert table is not None
+    assert table.header[2:9] == (*POLICIES[:6], "expert")
+    assert table.header[9:] == ("seeds", "seeds apart", "moved by", "order kept")
     assert [row[:2] for row in table.rows] == [(family, name) for family in ("FQE", "IS") for name in ERRORS]
-    assert "Nobody" not in table.caption and "return 250 on average (standard error 20)" in table.caption
+    assert "return 250 on average, discounted (standard error 20)" in table.caption
+    assert "values from reset (5 states) starts" in table.caption
     rows = {row[:2]: row for row in table.rows}
     assert rows["FQE", "none"][-2:] == ("-", "-")
     moved = {name: float(rows["IS", name][-2]) for name in ERRORS if name != "none"}
@@ -125,9 +121,33 @@ def test_estimates_are_told_where_nobody_knows_the_truth(analysis: Analysis) -> 
     one = found["IS", "scaling", "p0"]
     assert one.low < one.value < one.high and one.seeds == 3
     assert one.deviation == pytest.approx(np.std([part[0] for part in values], ddof=1))
+    apart = np.mean(np.std(values, axis=0, ddof=1))
+    assert (rows["IS", "scaling"][-4], float(rows["IS", "scaling"][-3])) == ("3", pytest.approx(apart, rel=0.01))
     assert estimates_table(analysis, "elsewhere") is None
     names = {table.name for table in all_tables(analysis)}
     assert "estimates-logs" in names and "estimates-adroit-door-human" not in names
+
+
+def test_estimates_are_compared_at_the_seeds_that_both_have() -> None:
+    whole = results_of({"logs": False})
+    far = cell("logs", "none", "IS", 9, error=9000.0, known=False)  # a seed that no other variant has
+    kept = tuple(part for part in whole.cells if part.variant != "oat-paper" or part.seed == 0)
+    partial = Analysis(dataclasses.replace(whole, cells=(*kept, far)))
+    rows = {row[:2]: row for row in estimates_table(partial, "logs").rows}
+    assert float(rows["IS", "scaling"][-2]) == pytest.approx(120, abs=2)
+    assert rows["IS", "none"][-4] == "4" and rows["IS", "oat-paper"][-4:-2] == ("1", "-")
+    assert "4 seeds (" in estimates_table(partial, "logs").caption
+
+
+def test_a_mean_of_fewer_estimators_is_said_to_be_so() -> None:
+    whole = results_of({"adroit-door-human": True, "maze2d-umaze": True})
+    lost = ("adroit-door-human", "scaling", "IS")
+    kept = tuple(part for part in whole.cells if (part.dataset, part.variant, part.family) != lost)
+    partial = Analysis(dataclasses.replace(whole, cells=kept))
+    rows = {row[0]: row for row in help_table(partial, "adroit-door-human", "mae").rows}
+    assert rows["scaling"][2].endswith("[1 of 2 estimators]") and "[" not in rows["jittering"][2]
+    overview = {row[0]: row for row in overview_table(partial, "mae").rows}
+    assert overview["scaling"][5].endswith("[1 of 2 estimators]") and "[" not in overview["scaling"][6]
 
 
 def test_a_variant_that_was_not_tried_on_a_dataset_has_no_row_there() -> None:
@@ -145,7 +165,10 @@ def test_the_logs_own_average_stands_below_the_estimators(analysis: Analysis) ->
     assert not any("recorded" in cell for row in rows for cell in row)
     told = floor_sentence(analysis, "adroit-door-human")
     assert told in make_page((analysis.results,))
-    assert "250 on average (standard error 20)" in told and f"off by {off:.0f}, further than every estimator" in told
+    assert (
+        "250 on average, discounted (standard error 20)" in told
+        and f"off by {off:.0f}, further than every estimator" in told
+    )
     far = [cell("adroit-door-human", "none", "IS", seed, error=500.0) for seed in range(3)]
     whole = results_of({"adroit-door-human": True})
     kept = (*(part for part in whole.cells if (part.variant, part.family) != ("none", "IS")), *far)

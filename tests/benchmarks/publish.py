@@ -2,18 +2,19 @@
 
     python tests/benchmarks/publish.py [RESULTS ...] --into tests/benchmarks/results/benchmark
 
-Computing all cells takes tens of CPU hours, in parts and on several machines. What is published of them are three files
-of numbers: `cells.csv` (metrics of every cell), `improvements.csv` (every improvement with its variances) and
-`recorded.csv` (the mean recorded return of each dataset). All other tables and the pictures of bars come from these
-alone, so that nobody needs the cells to check them, or to add what a new run computed.
+Computing all cells takes tens of CPU hours, in parts and on several machines. What is published of them are four files
+of numbers: `cells.csv` (metrics of every cell), `improvements.csv` (every improvement with its variances),
+`estimates.csv` (of datasets whose true values are not known) and `recorded.csv` (the mean recorded return of each
+dataset). All tables but table 1 and the pictures of bars come from these alone, so that nobody needs the cells to check
+them, or to add what a new run computed. A row of table 1 is of the run whose cells are published.
 
 A run's rows of a variant on a dataset replace the published ones where these are of fewer seeds or of another
 configuration. An improvement is of the run that computed the variant, over the same run's cells without augmentation.
 Where these are of another configuration than the published ones (other data, starts, estimators, versions of numpy or
 torch), everything published of that dataset is left out first. A run that computes published variants anew, the same
-seeds and configurations, adds improvements over a baseline that they were not compared with, and estimates that were
-not published. Only cells of the budget
-"standard" from reset starts are published.
+seeds and configurations, adds improvements over a baseline that they were not compared with; where the true values
+are not known, its cells and estimates replace the published ones. Only cells of the budget "standard" from reset starts
+are published. What was taken of each run is printed.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class Numbers:
 
     def write(self, folder: Path) -> None:
         """Write the files; none without rows."""
-        for name in FILES:
+        for name in reversed(FILES):  # cells last: by them `merged` tells, after an interruption, what is to be taken
             rows, path = _sorted(getattr(self, name)), folder / f"{name}.csv"
             if rows:
                 write_atomically(path, to_csv(rows).encode())
@@ -94,7 +95,9 @@ def merged(old: Numbers, new: Numbers) -> Numbers:
     changed = {pair for pair in before.keys() & after.keys() if _differ(before[pair], after[pair])}
     other = {name for name, variant in changed if variant == NONE}
     more = {pair for pair, keys in after.items() if len(keys) > len(before.get(pair, ()))}
-    taken = {pair for pair in after if pair in changed | more or pair[0] in other}
+    whole = {pair for pair, keys in after.items() if keys.keys() >= before.get(pair, keys).keys()}
+    estimated = {(row["dataset"], row["variant"]) for row in new.estimates} & whole
+    taken = {pair for pair in after if pair in changed | more | estimated or pair[0] in other}
 
     def kept(rows: Sequence[Row]) -> list[Row]:
         return [row for row in rows if row["dataset"] not in other and (row["dataset"], row["variant"]) not in taken]
@@ -111,14 +114,11 @@ def merged(old: Numbers, new: Numbers) -> Numbers:
         if _comparison(row) not in compared
         and {(row["dataset"], row["variant"]), (row["dataset"], row["baseline"])} <= same
     ]
-    estimates = (*kept(old.estimates), *fresh(new.estimates))
-    told = {(row["dataset"], row["variant"]) for row in estimates}
-    untold = [row for row in new.estimates if (row["dataset"], row["variant"]) in same - told]
     recorded = {row["dataset"]: row for row in (*old.recorded, *new.recorded)}
     return Numbers(
         cells=(*kept(old.cells), *fresh(new.cells)),
         improvements=(*standing, *fresh(new.improvements), *more_pairs),
-        estimates=(*estimates, *untold),
+        estimates=(*kept(old.estimates), *fresh(new.estimates)),
         recorded=tuple(recorded.values()),
     )
 
@@ -195,9 +195,9 @@ class Published(Analysis):
 
 def estimate_of(row: Row) -> Estimate:
     """Return what a row of estimates says."""
-    value, low, high, deviation = (_number(row[name]) for name in ("value", "low", "high", "deviation"))
     dataset, variant, family, policy = (row[name] for name in ("dataset", "variant", "family", "policy"))
-    return Estimate(dataset, variant, family, policy, int(row["seeds"]), value, low, high, deviation)
+    numbers = (_number(row[name]) for name in ("value", "low", "high", "deviation", "change"))
+    return Estimate(dataset, variant, family, policy, int(row["seeds"]), *numbers)
 
 
 def _number(text: str) -> float:
@@ -227,16 +227,38 @@ def _results(rows: Iterable[Row]) -> Results:
 def tables_of(published: Published, runs: Sequence[Analysis], into: Path) -> list[Table]:
     """Return the tables that are published; table 1 needs the estimates of a run."""
     tables = [table for table in all_tables(published) if table.name.startswith(KEPT)]
-    first = (table_1(run, name) for run in runs for name in run.results.datasets)
-    return tables + [with_former_rows(table, into / f"{table.name}.md") for table in first if table is not None]
+    first: dict[str, Table] = {}
+    for run, dataset in ((each, name) for each in runs for name in each.results.datasets):
+        table = table_1(published_part(run, published), dataset)
+        if table is not None:
+            path = into / f"{table.name}.md"
+            former = first.get(table.name) or (path.read_text() if path.exists() else "")
+            text = former.to_markdown() if isinstance(former, Table) else former
+            first[table.name] = with_former_rows(table, text)
+    return [*tables, *first.values()]
 
 
-def with_former_rows(table: Table, path: Path) -> Table:
-    """Return a run's table 1 with the published rows of methods that the run does not have, in the usual order."""
-    if not path.exists():
+def published_part(run: Analysis, published: Analysis) -> Analysis:
+    """Return a run with the cells whose configurations, of all seeds, are the published ones."""
+    own, there = (_configurations(_heads(each.results)) for each in (run, published))
+    cells = [c for c in run.results.cells if own[c.dataset, c.variant] == there.get((c.dataset, c.variant))]
+    return Analysis(replace(run.results, cells=tuple(cells)))
+
+
+def _heads(results: Results) -> list[Row]:
+    return [
+        {"dataset": c.dataset, "variant": c.variant, "family": c.family, "seed": c.seed, **c.record}
+        for c in results.cells
+        if not c.failed
+    ]
+
+
+def with_former_rows(table: Table, former: str) -> Table:
+    """Return a table 1 with those rows of another, in markdown, whose methods it does not have, in the usual order."""
+    lines = [line for line in former.splitlines() if line.startswith("| ")]
+    if not lines or tuple(lines[0][2:-2].split(" | ")) != table.header:
         return table
-    lines = [line for line in path.read_text().splitlines() if line.startswith("| ")][2:]
-    rows = {tuple(cells[:2]): cells for cells in (tuple(line[2:-2].split(" | ")) for line in lines)}
+    rows = {tuple(cells[:2]): cells for cells in (tuple(line[2:-2].split(" | ")) for line in lines[2:])}
     rows |= {row[:2]: row for row in table.rows}
     order = [method_name(variant) for variant in VARIANTS]
     place = {name: number for number, name in enumerate(order)}
@@ -263,7 +285,8 @@ def publish(runs: Sequence[Path], into: Path) -> Numbers:
     analyses = [Analysis(results) for path in runs for results in read_results(path) if results.setting == SETTING]
     numbers = Numbers.read(into)
     for analysis in analyses:
-        numbers = merged(numbers, Numbers.of(analysis))
+        former, numbers = numbers, merged(numbers, Numbers.of(analysis))
+        tell(former, numbers, analysis)
     numbers.write(into)
     published = Published(Numbers.read(into))
     tables = {f"{table.name}.md": table for table in tables_of(published, analyses, into)}
@@ -275,6 +298,16 @@ def publish(runs: Sequence[Path], into: Path) -> Numbers:
     for name, image in pictures_of(published).items():
         write_atomically(into / name, image)
     return numbers
+
+
+def tell(old: Numbers, new: Numbers, run: Analysis) -> None:
+    """Print which cells of a run replace published ones or add to them, and which are left out."""
+    before, after = ({(row["dataset"], row["variant"], str(row)) for row in each.cells} for each in (old, new))
+    taken = {key[:2] for key in after - before}
+    there = dict.fromkeys((cell.dataset, cell.variant) for cell in run.results.cells)
+    for word, chosen in (("taken", True), ("as published, or of fewer seeds", False)):
+        names = [f"{dataset} {variant}" for dataset, variant in there if ((dataset, variant) in taken) == chosen]
+        print(f"{word}: {', '.join(names) or '-'}")
 
 
 def _read(path: Path) -> tuple[Row, ...]:

@@ -90,7 +90,7 @@ def test_a_run_of_published_variants_adds_comparisons_that_were_not_there(script
     assert script.merged(old, script.Numbers.of(only(two_seeds, "oat-paper", "none", "jittering"))) == old
 
 
-def test_a_run_of_published_variants_adds_estimates_that_were_not_there(script: ModuleType) -> None:
+def test_estimates_are_of_the_newest_run_with_all_seeds(script: ModuleType) -> None:
     whole = Analysis(results_of({"tutoring-smartprimer": False}))
     numbers = script.Numbers.of(whole)
     bare = dataclasses.replace(numbers, estimates=())
@@ -99,7 +99,12 @@ def test_a_run_of_published_variants_adds_estimates_that_were_not_there(script: 
     assert {row["variant"] for row in more.estimates} == {"none", "scaling"}
     assert len(script.merged(more, numbers).estimates) == len(numbers.estimates)
     fewer = Analysis(dataclasses.replace(whole.results, cells=tuple(c for c in whole.results.cells if c.seed > 0)))
-    assert script.merged(bare, script.Numbers.of(fewer)).estimates == ()
+    assert script.merged(bare, script.Numbers.of(fewer)) == bare
+    newer = [
+        dataclasses.replace(c, record=dict(c.record) | {"environment": {"commit": "new"}}) for c in whole.results.cells
+    ]
+    again = script.Numbers.of(Analysis(dataclasses.replace(whole.results, cells=tuple(newer))))
+    assert {row["commit"] for row in script.merged(numbers, again).cells} == {"new"}
 
 
 def test_more_seeds_and_other_settings_replace_what_is_published(script: ModuleType) -> None:
@@ -129,14 +134,24 @@ def test_another_ground_leaves_out_all_that_was_published_of_a_dataset(script: M
     assert {row["variant"] for row in new.cells if row["dataset"] == "maze2d-umaze"} == set(ERRORS)
 
 
-def test_table_1_keeps_rows_of_methods_that_a_run_does_not_have(script: ModuleType, tmp_path: Path) -> None:
-    head, path = ("method", "test", "a"), tmp_path / "table-01-line.md"
+def test_table_1_keeps_rows_of_methods_that_a_run_does_not_have(script: ModuleType) -> None:
+    head = ("method", "test", "a")
     former = (("NoAug. (none)", "paper", "1"), ("Jittering", "paper", "2"), ("Empirical result", "roll-outs", "3"))
-    path.write_text(script.Table("table-01-line", "Before", head, former).to_markdown())
+    text = script.Table("table-01-line", "Before", head, former).to_markdown()
     now = script.Table("table-01-line", "Now", head, (("NoAug. (none)", "paper", "4"), ("SPAWNER", "paper", "5")))
-    found = script.with_former_rows(now, path)
+    found = script.with_former_rows(now, text)
     assert (found.caption, found.rows) == ("Now", (now.rows[0], now.rows[1], former[1], former[2]))
-    assert script.with_former_rows(now, tmp_path / "nothing.md") == now
+    assert script.with_former_rows(now, "") == now
+    assert script.with_former_rows(dataclasses.replace(now, header=(*head[:2], "b")), text).rows == now.rows
+
+
+def test_table_1_is_of_the_cells_that_are_published(script: ModuleType) -> None:
+    whole = Analysis(results_of({"adroit-door-human": True}))
+    published = script.Published(script.Numbers.of(only(whole, "none", "scaling")))
+    fewer = [c for c in whole.results.cells if c.seed > 0 or c.variant != "scaling"]
+    run = Analysis(dataclasses.replace(whole.results, cells=tuple(fewer)))
+    assert {c.variant for c in script.published_part(run, published).results.cells} == {"none"}
+    assert {c.variant for c in script.published_part(whole, published).results.cells} == {"none", "scaling"}
 
 
 def test_what_is_published_is_what_its_numbers_say(script: ModuleType) -> None:
