@@ -12,8 +12,9 @@ A run's rows of a variant on a dataset replace the published ones where these ar
 configuration. An improvement is of the run that computed the variant, over the same run's cells without augmentation.
 Where these are of another configuration than the published ones (other data, starts, estimators, versions of numpy or
 torch), everything published of that dataset is left out first. A run that computes published variants anew, the same
-seeds and configurations, adds improvements over a baseline that they were not compared with; where the true values
-are not known, its cells and estimates replace the published ones. Only cells of the budget "standard" from reset starts
+seeds and configurations, adds improvements over a baseline that they were not compared with, and one of more seeds that
+lacks a baseline leaves those over it. Where the true values are not known, a run's cells and estimates replace the
+published ones. Only cells of the budget "standard" from reset starts
 are published. What was taken of each run is printed.
 """
 
@@ -106,7 +107,15 @@ def merged(old: Numbers, new: Numbers) -> Numbers:
         return [row for row in rows if (row["dataset"], row["variant"]) in taken]
 
     same = {pair for pair, keys in after.items() if pair in taken or before.get(pair) == keys}
-    standing = [row for row in kept(old.improvements) if (row["dataset"], row["baseline"]) not in changed]
+    measured = {_comparison(row) for row in new.improvements}
+    grown = [  # of a run with more seeds, over a baseline that it lacks
+        row
+        for row in old.improvements
+        if row["dataset"] not in other
+        and (row["dataset"], row["variant"]) in taken - changed
+        and _comparison(row) not in measured
+    ]
+    standing = [row for row in (*kept(old.improvements), *grown) if (row["dataset"], row["baseline"]) not in changed]
     compared = {_comparison(row) for row in (*standing, *fresh(new.improvements))}
     more_pairs = [
         row

@@ -116,8 +116,10 @@ def test_more_seeds_and_other_settings_replace_what_is_published(script: ModuleT
         for family in ("FQE", "IS")
     ]
     more = script.merged(old, script.Numbers.of(only(run_of(*fourth), "none", "scaling")))
-    assert {row["seeds"] for row in improvements(more, "scaling")} == {"4"}
+    assert {row["seeds"] for row in improvements(more, "scaling") if row["baseline"] == "none"} == {"4"}
     assert {row["seeds"] for row in improvements(more, "jittering")} == {"3"}
+    over_oat = [row for row in improvements(more, "scaling") if row["baseline"] == "oat-paper"]
+    assert over_oat and over_oat == [row for row in old.improvements if row in over_oat]  # that run had no OAT
     part = cell("adroit-door-human", "oat-paper", "FQE", 0, error=1.0)
     part = dataclasses.replace(part, record=dict(part.record) | {"fingerprint": "other"})
     other = script.merged(old, script.Numbers.of(only(run_of(part), "none", "oat-paper")))
