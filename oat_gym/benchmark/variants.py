@@ -39,6 +39,8 @@ class Variant:
         paper: the row of the paper's tables that this one repeats, "" for none.
         targets: in roll-outs the target policies act (one of them, drawn anew for each step), not the clone.
         note: one line that says what it is.
+        revision: of the method's code. Raise it when a change alters what is generated from the same settings: cells of
+            before are then computed again.
 
     >>> find_variant("jittering").use_augmented, find_variant("jittering+training").use_augmented
     ('all', None)
@@ -51,6 +53,7 @@ class Variant:
     paper: str = ""
     targets: bool = False
     note: str = ""
+    revision: int = 0
 
     def __post_init__(self) -> None:
         if (self.augmenter is None) != (self.name == NONE):
@@ -71,7 +74,8 @@ class Variant:
         if self.augmenter is None:
             return {"augmenter": None}
         described = {"augmenter": self.augmenter, "factor": float(self.factor), "use_augmented": self.use_augmented}
-        return described | ({"targets": True} if self.targets else {})
+        described |= {"targets": True} if self.targets else {}
+        return described | ({"revision": self.revision} if self.revision else {})
 
 
 @dataclass(frozen=True)

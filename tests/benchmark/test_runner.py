@@ -112,7 +112,9 @@ def test_a_cell_depends_on_its_own_inputs_only(finished: tuple[Plan, Path], tmp_
         np.testing.assert_array_equal(parts[0], everything[key][0])
 
 
-def test_a_changed_configuration_is_another_cell(finished: tuple[Plan, Path]) -> None:
+def test_a_changed_configuration_is_another_cell(
+    finished: tuple[Plan, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     plan, folder = finished
     other = plan_of(question=dataclasses.replace(QUESTION, initial="data"))
     names = {cell.fingerprint for job in plan.jobs for cell in job.cells()}
@@ -122,6 +124,9 @@ def test_a_changed_configuration_is_another_cell(finished: tuple[Plan, Path]) ->
     assert len(plan_of(budget=more).open_jobs(folder)) == 2
     assert plan_of().open_jobs(folder) == ()
     assert plan_of("jittering+training").open_jobs(folder)
+    corrected = dataclasses.replace(VARIANTS["jittering"], revision=1)
+    monkeypatch.setitem(VARIANTS, "jittering", corrected)
+    assert [job.variant for job in plan_of().open_jobs(folder)] == [corrected]
 
 
 def test_processes_give_the_same_cells(finished: tuple[Plan, Path], tmp_path: Path) -> None:

@@ -11,9 +11,11 @@ them, or to add what a new run computed. A row of table 1 is of the run whose ce
 A run's rows of a variant on a dataset replace the published ones where these are of fewer seeds or of another
 configuration. An improvement is of the run that computed the variant, over the same run's cells without augmentation.
 Where these are of another configuration than the published ones (other data, starts, estimators, versions of numpy or
-torch), everything published of that dataset is left out first. A run that computes published variants anew, the same
-seeds and configurations, adds improvements over a baseline that they were not compared with, and one of more seeds that
-lacks a baseline leaves those over it. Where the true values are not known, a run's cells and estimates replace the
+torch), everything published of that dataset is left out first. Of the same configuration, a variant that comes out
+otherwise than published, where the cells without augmentation come out as published, is of a method whose code was
+changed, and its rows replace the published ones too. A run that computes published variants anew, the same seeds and
+configurations, adds improvements over a baseline that they were not compared with, and one of more seeds that lacks a
+baseline leaves those over it. Where the true values are not known, a run's cells and estimates replace the
 published ones. Only cells of the budget "standard" from reset starts
 are published. What was taken of each run is printed.
 """
@@ -24,7 +26,7 @@ import argparse
 import base64
 import csv
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -38,7 +40,7 @@ from oat_gym.benchmark.budget import BUDGETS
 from oat_gym.benchmark.grid import Table
 from oat_gym.benchmark.protocol import SUITES, Question
 from oat_gym.benchmark.results import Results, Setting, read_results
-from oat_gym.benchmark.scores import Metric
+from oat_gym.benchmark.scores import METRICS, Metric
 from oat_gym.benchmark.store import CellResult
 from oat_gym.benchmark.tables import all_tables, method_name, table_1
 from oat_gym.benchmark.tidy import Row, cell_rows, improvement_of, improvement_rows, to_csv
@@ -51,6 +53,7 @@ FILES = ("cells", "improvements", "estimates", "recorded")
 KEPT = ("dataset-", "estimates-", "helped-mae-", "helped-rank_correlation-", "against-oat-mae-", "overview-", "table-")
 """How the names of the tables that are published begin."""
 _EMPTY = np.empty(0)
+_Metrics = dict[tuple[str, str], dict[tuple[str, str], tuple[str, ...]]]
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,7 @@ def merged(old: Numbers, new: Numbers) -> Numbers:
     before, after = _configurations(old.cells), _configurations(new.cells)
     changed = {pair for pair in before.keys() & after.keys() if _differ(before[pair], after[pair])}
     other = {name for name, variant in changed if variant == NONE}
+    changed |= _come_out_otherwise(_metrics(old.cells), _metrics(new.cells))
     more = {pair for pair, keys in after.items() if len(keys) > len(before.get(pair, ()))}
     whole = {pair for pair, keys in after.items() if keys.keys() >= before.get(pair, keys).keys()}
     estimated = {(row["dataset"], row["variant"]) for row in new.estimates} & whole
@@ -144,8 +148,26 @@ def _configurations(rows: Iterable[Row]) -> dict[tuple[str, str], dict[tuple[str
     return found
 
 
-def _differ(keys: dict[tuple[str, str], str], others: dict[tuple[str, str], str]) -> bool:
-    return any(keys[place] != others[place] for place in keys.keys() & others.keys())
+def _metrics(rows: Iterable[Row]) -> _Metrics:
+    """Return (dataset, variant) -> (family, seed) -> metrics, of cells whose true values are known."""
+    found: _Metrics = {}
+    for row in rows:
+        if row["mae"]:
+            numbers = found.setdefault((row["dataset"], row["variant"]), {})
+            numbers[row["family"], row["seed"]] = tuple(row[metric] for metric in METRICS)
+    return found
+
+
+def _come_out_otherwise(before: _Metrics, after: _Metrics) -> set[tuple[str, str]]:
+    """Return the pairs whose metrics differ, of datasets on which those without augmentation do not."""
+    none = {name for name, variant in before.keys() & after.keys() if variant == NONE}
+    same = {name for name in none if not _differ(before[name, NONE], after[name, NONE])}
+    both = {pair for pair in before.keys() & after.keys() if pair[0] in same}
+    return {pair for pair in both if _differ(before[pair], after[pair])}
+
+
+def _differ(parts: Mapping[tuple[str, str], Any], others: Mapping[tuple[str, str], Any]) -> bool:
+    return any(parts[place] != others[place] for place in parts.keys() & others.keys())
 
 
 class Published(Analysis):

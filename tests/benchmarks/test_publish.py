@@ -127,6 +127,20 @@ def test_more_seeds_and_other_settings_replace_what_is_published(script: ModuleT
     assert {row["baseline"] for row in improvements(other, "scaling")} == {"none"}  # those over the former are gone
 
 
+def test_a_method_that_was_corrected_replaces_its_rows(script: ModuleType) -> None:
+    """Its configuration does not tell; that the same cells without augmentation come out as before does."""
+    old = script.Numbers.of(Analysis(results_of({"adroit-door-human": True})))
+    corrected = [cell("adroit-door-human", "oat-paper", "FQE", seed, error=10.0) for seed in range(3)]
+    run = only(run_of(*corrected), "none", "oat-paper")
+    new = script.merged(old, script.Numbers.of(run))
+    assert improvements(new, "oat-paper") == improvements(script.Numbers.of(run), "oat-paper")
+    assert improvements(new, "oat-paper") != improvements(old, "oat-paper")
+    assert {row["baseline"] for row in improvements(new, "scaling")} == {"none"}  # those over the former are gone
+    elsewhere = [cell("adroit-door-human", "none", "FQE", seed, error=99.0) for seed in range(3)]
+    rounded_otherwise = only(run_of(*corrected, *elsewhere), "none", "oat-paper")
+    assert script.merged(old, script.Numbers.of(rounded_otherwise)) == old
+
+
 def test_another_ground_leaves_out_all_that_was_published_of_a_dataset(script: ModuleType) -> None:
     old = script.Numbers.of(Analysis(results_of(DATASETS)))
     ground = [cell("adroit-door-human", "none", "FQE", seed, error=50.0) for seed in range(3)]
