@@ -112,9 +112,7 @@ def test_a_cell_depends_on_its_own_inputs_only(finished: tuple[Plan, Path], tmp_
         np.testing.assert_array_equal(parts[0], everything[key][0])
 
 
-def test_a_changed_configuration_is_another_cell(
-    finished: tuple[Plan, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_changed_configuration_is_another_cell(finished: tuple[Plan, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     plan, folder = finished
     other = plan_of(question=dataclasses.replace(QUESTION, initial="data"))
     names = {cell.fingerprint for job in plan.jobs for cell in job.cells()}
