@@ -128,6 +128,7 @@ def write_manifest(folder: Path, plan: Plan, *, seeds: Sequence[int], device: st
         "about": plan.suite.about,
         "unknown_truth": plan.unknown_truth,
         "truths": {name: _truth(truth) for name, truth in plan.truths.items()},
+        "truth_notes": {name: truth.note for name, truth in plan.truths.items()},
         "recorded": plan.recorded,
         "jobs_order": list(variants),
         "notes": {name: variant.note for name, variant in variants.items()},

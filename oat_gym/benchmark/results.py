@@ -183,17 +183,22 @@ def _shared(cell: CellResult) -> str:
 
 
 def with_truth(cells: Iterable[CellResult], manifests: Sequence[Mapping[str, Any]]) -> Iterator[CellResult]:
-    """Give the cells with the true values that the last run on their ground knew: better ones may have been made."""
+    """Give the cells with the true values that the last run on their ground knew: better ones may have been made.
+
+    What is said of other values than the cell's own is the run's too; a run of an older version says nothing.
+    """
     known = {
-        (name, _valued(manifest["grounds"][name])): truth
+        (name, _valued(manifest["grounds"][name])): (truth, manifest.get("truth_notes", {}).get(name))
         for manifest in manifests
         for name, truth in manifest["truths"].items()
     }
     for cell in cells:
-        truth = known.get((cell.dataset, _ground(cell)))
+        truth, note = known.get((cell.dataset, _ground(cell)), (None, None))
         if truth is None or cell.failed:
             yield cell
             continue
         unknown = (math.nan, math.nan)
         pairs = np.array([truth.get(name, unknown) for name in cell.policies], dtype=np.float64).reshape(-1, 2)
-        yield replace(cell, true=pairs[:, 0], true_errors=pairs[:, 1])
+        changed = note is not None and not np.array_equal(pairs[:, 0], cell.true, equal_nan=True)
+        record = {**cell.record, "truth_note": note} if changed else cell.record
+        yield replace(cell, true=pairs[:, 0], true_errors=pairs[:, 1], record=record)

@@ -340,6 +340,19 @@ def test_a_policy_without_a_true_value_leaves_the_dataset_without_errors(tmp_pat
     manifest = {"grounds": {"adroit-door-human": member.record["config"]["ground"]}, "truths": truths}
     (known,) = with_truth([member], [manifest])
     assert not known.knows_truth and np.isfinite(known.true[1:]).all()
+    assert known.record["truth_note"] == member.record["truth_note"]
+
+
+def test_a_note_on_true_values_is_of_the_values_that_are_shown() -> None:
+    member = cell("adroit-door-human", "none", "FQE", 0, error=3.0)
+    member = dataclasses.replace(member, record=dict(member.record) | {"truth_note": "Of 10 roll-outs. A doubt."})
+    own = {name: [float(value), 0.0] for name, value in zip(member.policies, member.true, strict=True)}
+    ground = {"adroit-door-human": member.record["config"]["ground"]}
+    notes = {"adroit-door-human": "Of 1,000 roll-outs."}
+    for truth, note in ((own, "Of 10 roll-outs. A doubt."), ({name: [1.0, 0.1] for name in own}, notes[member.dataset])):
+        manifest = {"grounds": ground, "truths": {"adroit-door-human": truth}, "truth_notes": notes}
+        (known,) = with_truth([member], [manifest])
+        assert known.record["truth_note"] == note
 
 
 def test_tidy_rows_keep_every_number(analysis: Analysis, tmp_path: Path) -> None:

@@ -326,8 +326,12 @@ def publish(runs: Sequence[Path], into: Path) -> Numbers:
     for path in into.glob("*.md"):
         if path.name.startswith(KEPT) and path.name not in tables and not path.name.startswith("table-01"):
             path.unlink()
-    for name, image in pictures_of(published).items():
+    pictures = pictures_of(published)
+    for name, image in pictures.items():
         write_atomically(into / name, image)
+    for path in into.glob("bars-*.png"):
+        if path.name not in pictures:
+            path.unlink()
     return numbers
 
 

@@ -179,3 +179,15 @@ def test_what_is_published_is_what_its_numbers_say(script: ModuleType) -> None:
         assert (PUBLISHED / f"{table.name}.md").read_text() == table.to_markdown(), table.name
     written = {path.stem for path in PUBLISHED.glob("*.md") if path.stem.startswith(script.KEPT)}
     assert written == {table.name for table in tables} | {"table-01-tutor-sim"}
+
+
+def test_what_nothing_published_is_of_is_removed(script: ModuleType, tmp_path: Path) -> None:
+    script.Numbers.of(Analysis(results_of(DATASETS))).write(tmp_path)
+    numbers = script.Numbers.read(tmp_path)
+    others = ("README.md", "table-01-tutor-sim.md", "estimates-maze2d-umaze-d4rl.png")
+    for name in (*others, "bars-sepsis-sim.png", "dataset-sepsis-sim.md"):
+        (tmp_path / name).write_text("kept or not")
+    assert script.publish((), tmp_path) == numbers
+    there = {path.name for path in tmp_path.iterdir()}
+    assert {*others, "bars-maze2d-umaze.png", "dataset-maze2d-umaze.md", "cells.csv"} <= there
+    assert there.isdisjoint({"bars-sepsis-sim.png", "dataset-sepsis-sim.md"})
