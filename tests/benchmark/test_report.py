@@ -349,7 +349,8 @@ def test_a_note_on_true_values_is_of_the_values_that_are_shown() -> None:
     own = {name: [float(value), 0.0] for name, value in zip(member.policies, member.true, strict=True)}
     ground = {"adroit-door-human": member.record["config"]["ground"]}
     notes = {"adroit-door-human": "Of 1,000 roll-outs."}
-    for truth, note in ((own, "Of 10 roll-outs. A doubt."), ({name: [1.0, 0.1] for name in own}, notes[member.dataset])):
+    other = {name: [1.0, 0.1] for name in own}
+    for truth, note in ((own, "Of 10 roll-outs. A doubt."), (other, "Of 1,000 roll-outs.")):
         manifest = {"grounds": ground, "truths": {"adroit-door-human": truth}, "truth_notes": notes}
         (known,) = with_truth([member], [manifest])
         assert known.record["truth_note"] == note
