@@ -1,4 +1,4 @@
-"""What captions must say: seeds, setting, budget, stand-ins for the paper's data."""
+"""What captions must say: seeds, setting, budget, what is missing, stand-ins for the paper's data."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ USES = (
 
 
 def notes(analysis: Analysis, datasets: Mapping[str, str | None], *, signs: bool = True) -> str:
-    """Return what a caption must say: seeds, setting, budget, stand-ins, and what means and `SIGNS` are."""
+    """Return what a caption must say: seeds, setting, budget, missing data, stand-ins, and what means and `SIGNS` are."""
     there = [name for name in datasets.values() if name is not None]
     told, fewer = seed_numbers(analysis, there)
     text = f"{told}{', mean ± standard deviation' if signs else ''}; "
     text += "rows of other seeds are compared by the seeds that they share; " if signs and fewer else ""
     text += f"{analysis.results.setting.describe()}; {'; '.join(budget_lines(analysis.results))}."
     text += " + or - : better or worse than no augmentation, 95% interval excludes zero." if signs else ""
-    stand_ins = stand_ins_of(there)
+    absent, stand_ins = [task for task, name in datasets.items() if name is None], stand_ins_of(there)
+    text += f" Not measured here: {', '.join(absent)}." if absent else ""
     return text + (f" Stand-ins, not the paper's data: {', '.join(stand_ins)}." if stand_ins else "")
 
 

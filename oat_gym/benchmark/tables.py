@@ -57,7 +57,7 @@ def paper_table(analysis: Analysis, level: str, metric: Metric) -> Table | None:
     rows = [
         (family, method_name(variant), *_pairs(analysis, datasets, level, metric, family=family, variant=variant))
         for family in analysis.results.families
-        for variant in analysis.results.variants
+        for variant in _methods(analysis, *datasets.values())
     ]
     number = paper.TABLES[level, metric]
     header = ("estimator", "method", *(text for task in paper.TASKS for text in (task, "paper")))
@@ -66,15 +66,16 @@ def paper_table(analysis: Analysis, level: str, metric: Metric) -> Table | None:
 
 
 def table_2(analysis: Analysis) -> Table | None:
-    """Return table 2: averages over the estimators, Adroit human, all four metrics of each task."""
+    """Return table 2: averages over the estimators, Adroit human, all four metrics of each task.
+
+    Of a task that was not measured it has the paper's numbers alone.
+    """
     datasets = {task: adroit_dataset(analysis, "human", task) for task in paper.TASKS}
     if not any(datasets.values()):
         return None
     rows: list[tuple[str, ...]] = []
     for task, dataset in datasets.items():
-        if dataset is None:
-            continue
-        for variant in analysis.results.variants:
+        for variant in _methods(analysis, dataset):
             cells = [
                 text
                 for metric in METRICS
@@ -91,12 +92,10 @@ def dataset_table(analysis: Analysis, dataset: str) -> Table:
 
     The last row is the error of the mean recorded return, said of every policy (`Analysis.floor`).
     """
-    tried = {cell.variant for cell in analysis.results.cells if cell.dataset == dataset}
     rows = [
         (family, variant, *(cell_text(analysis, dataset, variant, family, metric) for metric in METRICS))
         for family in (*analysis.results.families, MEAN)
-        for variant in analysis.results.variants
-        if variant in tried
+        for variant in _tried(analysis, dataset)
     ]
     floor = analysis.floor(dataset)
     if floor is not None:
@@ -300,6 +299,19 @@ def _printed(number: paper.Printed, metric: Metric) -> str:
     digits = 0 if metric == "mae" else 2
     text = f"{number.mean:.{digits}f}"
     return text if math.isnan(number.deviation) else f"{text} ± {number.deviation:.{digits}f}"
+
+
+def _tried(analysis: Analysis, *datasets: str | None) -> list[str]:
+    """Return the variants that were tried on one of the datasets."""
+    there = {cell.variant for cell in analysis.results.cells if cell.dataset in datasets}
+    return [variant for variant in analysis.results.variants if variant in there]
+
+
+def _methods(analysis: Analysis, *datasets: str | None) -> list[str]:
+    """Return the variants that were tried on one of the datasets, and those that the paper has numbers of."""
+    there = _tried(analysis, *datasets)
+    printed = [name for name, variant in VARIANTS.items() if variant.paper]
+    return [name for name in analysis.results.variants if name in there or name in printed]
 
 
 def method_name(variant: str) -> str:

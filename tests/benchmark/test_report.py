@@ -1,26 +1,21 @@
-"""From cells to tables, figures and the page: numbers that are known beforehand come out where they belong."""
+"""From cells to improvements, files, pictures and the page: what is known beforehand comes out."""
 
 import csv
 import dataclasses
 import math
 import re
-import time
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from oat_gym.benchmark import figures, paper
+from oat_gym.benchmark import figures
 from oat_gym.benchmark.analysis import Analysis
-from oat_gym.benchmark.estimates import estimates_table
-from oat_gym.benchmark.grid import write_tables
 from oat_gym.benchmark.improvement import Parts
 from oat_gym.benchmark.page import make_page
-from oat_gym.benchmark.protocol import Question
-from oat_gym.benchmark.results import Results, Setting, with_truth
-from oat_gym.benchmark.scores import METRICS
-from oat_gym.benchmark.store import CellResult, read_result, write_result
+from oat_gym.benchmark.results import Results, with_truth
+from oat_gym.benchmark.store import read_result, write_result
 from oat_gym.benchmark.story import (
     bar_panels,
     best_sentences,
@@ -30,56 +25,10 @@ from oat_gym.benchmark.story import (
     level_panels,
     sentence,
 )
-from oat_gym.benchmark.tables import all_tables, dataset_table, help_table, overview_table, paper_table
+from oat_gym.benchmark.tables import dataset_table
 from oat_gym.benchmark.tidy import cell_rows, estimate_rows, improvement_of, improvement_rows, to_csv, write_tidy
 from oat_gym.errors import CacheError, ConfigurationError
-
-POLICIES = tuple(f"p{number}" for number in range(7))
-TRUE = np.linspace(0.0, 600.0, 7)
-QUESTION = {"initial": "reset", "behavior": "clone", "gamma": None}
-GROUND = {"data": "x", "computed": "numpy 2"}
-
-
-def cell(
-    dataset: str, variant: str, family: str, seed: int, *, error: float, known: bool = True, reason: str = ""
-) -> CellResult:
-    """A cell whose estimates are off by `error`, give or take 1."""
-    rng = np.random.default_rng([seed, len(variant), len(family), int(error)])
-    values = TRUE + error + rng.normal(size=7)
-    return CellResult(
-        dataset=dataset, task="adroit-door", variant=variant, family=family, estimator=family, seed=seed, budget="full",
-        initial="reset (5 states)", policies=(*POLICIES[:6], "expert"), values=values,
-        replicates=values[:, None] + rng.normal(size=(7, 40)), true=TRUE if known else np.full(7, math.nan),
-        true_errors=np.zeros(7), reason=reason,
-        record={
-            "config": {"question": QUESTION, "ground": GROUND},
-            "fingerprint": f"{dataset}{variant}{family}{seed}", "n_episodes": 25,
-            "finished": float(seed), "gamma": 0.995, "horizon": 200, "truth_note": "" if known else "Nobody knows.",
-            "environment": {"numpy": "2"}, "cost": {"cpu_seconds": 1.0, "wall_seconds": 2.0, "peak_memory_mb": 3.0},
-        },
-    )  # fmt: skip
-
-
-ERRORS = {"none": 100.0, "oat-paper": 40.0, "jittering": 100.0, "scaling": 220.0}
-
-
-def results_of(datasets: dict[str, bool], *, seeds: int = 3, extra: tuple[CellResult, ...] = ()) -> Results:
-    cells = [
-        cell(name, variant, family, seed, error=error, known=known)
-        for name, known in datasets.items()
-        for variant, error in ERRORS.items()
-        for family in ("FQE", "IS")
-        for seed in range(seeds)
-    ]
-    manifest = {
-        "question": QUESTION, "budget": {"name": "full"}, "datasets": [*datasets, "adroit-pen-human"],
-        "jobs_order": list(ERRORS), "missing": {"adroit-pen-human": "run `minari download D4RL/pen/human-v2`"},
-        "grounds": dict.fromkeys(datasets, GROUND), "recorded": {name: [250.0, 20.0] for name in datasets},
-        "cells": {}, "budget_line": "budget 'full'", "command": "oat-gym bench", "started": time.time(),
-    }  # fmt: skip
-    members = (*cells, *extra)
-    manifest["cells"] = {str(number): part.record["fingerprint"] for number, part in enumerate(members)}
-    return Results(Setting("full", Question()), members, (manifest,), ())
+from tests.benchmark.known import ERRORS, TRUE, cell, results_of
 
 
 @pytest.fixture(scope="module")
@@ -100,61 +49,6 @@ def test_verdicts_follow_the_errors(analysis: Analysis) -> None:
     worse = sentence(verdicts["scaling"], of="scaling")
     numbers = [float(part) for part in re.findall(r"-?\d+(?:\.\d+)?", worse.split("%", 1)[1].replace("95%", ""))]
     assert "raises the error by 120%" in worse and numbers[0] < 120 < numbers[1]  # the interval is of the same sign
-
-
-def test_estimates_are_told_where_nobody_knows_the_truth(analysis: Analysis) -> None:
-    table = estimates_table(analysis, "logs")
-    assert table is not None
-    assert table.header[2:9] == (*POLICIES[:6], "expert")
-    assert table.header[9:] == ("seeds", "seeds apart", "moved by", "order kept")
-    assert [row[:2] for row in table.rows] == [(family, name) for family in ("FQE", "IS") for name in ERRORS]
-    assert "return 250 on average, discounted (standard error 20)" in table.caption
-    assert "values from reset (5 states) starts" in table.caption
-    rows = {row[:2]: row for row in table.rows}
-    assert rows["FQE", "none"][-2:] == ("-", "-")
-    moved = {name: float(rows["IS", name][-2]) for name in ERRORS if name != "none"}
-    assert moved == pytest.approx({"oat-paper": 60, "jittering": 0, "scaling": 120}, abs=2)
-    assert {row[-1] for row in table.rows if row[1] != "none"} == {"1.00"}  # errors that all policies share
-    values = [part.values for part in analysis.cells("logs", "scaling", "IS")]
-    assert rows["IS", "scaling"][2].startswith(f"{np.mean(values, axis=0)[0]:.0f} (")
-    found = {(each.family, each.variant, each.policy): each for each in analysis.estimates("logs")}
-    one = found["IS", "scaling", "p0"]
-    assert one.low < one.value < one.high and one.seeds == 3
-    assert one.deviation == pytest.approx(np.std([part[0] for part in values], ddof=1))
-    apart = np.mean(np.std(values, axis=0, ddof=1))
-    assert (rows["IS", "scaling"][-4], float(rows["IS", "scaling"][-3])) == ("3", pytest.approx(apart, rel=0.01))
-    assert estimates_table(analysis, "elsewhere") is None
-    names = {table.name for table in all_tables(analysis)}
-    assert "estimates-logs" in names and "estimates-adroit-door-human" not in names
-
-
-def test_estimates_are_compared_at_the_seeds_that_both_have() -> None:
-    whole = results_of({"logs": False})
-    far = cell("logs", "none", "IS", 9, error=9000.0, known=False)  # a seed that no other variant has
-    kept = tuple(part for part in whole.cells if part.variant != "oat-paper" or part.seed == 0)
-    partial = Analysis(dataclasses.replace(whole, cells=(*kept, far)))
-    rows = {row[:2]: row for row in estimates_table(partial, "logs").rows}
-    assert float(rows["IS", "scaling"][-2]) == pytest.approx(120, abs=2)
-    assert rows["IS", "none"][-4] == "4" and rows["IS", "oat-paper"][-4:-2] == ("1", "-")
-    assert "4 seeds (" in estimates_table(partial, "logs").caption
-
-
-def test_a_mean_of_fewer_estimators_is_said_to_be_so() -> None:
-    whole = results_of({"adroit-door-human": True, "maze2d-umaze": True})
-    lost = ("adroit-door-human", "scaling", "IS")
-    kept = tuple(part for part in whole.cells if (part.dataset, part.variant, part.family) != lost)
-    partial = Analysis(dataclasses.replace(whole, cells=kept))
-    rows = {row[0]: row for row in help_table(partial, "adroit-door-human", "mae").rows}
-    assert rows["scaling"][2].endswith("[1 of 2 estimators]") and "[" not in rows["jittering"][2]
-    overview = {row[0]: row for row in overview_table(partial, "mae").rows}
-    assert overview["scaling"][5].endswith("[1 of 2 estimators]") and "[" not in overview["scaling"][6]
-
-
-def test_a_variant_that_was_not_tried_on_a_dataset_has_no_row_there() -> None:
-    whole = results_of({"adroit-door-human": True})
-    kept = tuple(cell for cell in whole.cells if cell.variant != "scaling")
-    table = dataset_table(Analysis(Results(whole.setting, kept, whole.manifests, ())), "adroit-door-human")
-    assert {row[1] for row in table.rows} == {"none", "oat-paper", "jittering"}
 
 
 def test_the_logs_own_average_stands_below_the_estimators(analysis: Analysis) -> None:
@@ -179,22 +73,6 @@ def test_the_logs_own_average_stands_below_the_estimators(analysis: Analysis) ->
     assert unknown.floor("adroit-door-human") is None and floor_sentence(unknown, "adroit-door-human") == ""
 
 
-def test_variants_are_compared_with_one_another_in_pairs(analysis: Analysis) -> None:
-    table = help_table(analysis, "adroit-door-human", "mae", baseline="oat-paper")
-    rows = {row[0]: dict(zip(table.header, row, strict=True)) for row in table.rows}
-    assert table.name == "against-oat-paper-mae-adroit-door-human"
-    assert "no augmentation" not in table.caption
-    assert "better than oat-paper" in table.caption and "over oat-paper" in table.caption
-    assert set(rows) == {"jittering", "scaling"}
-    assert all(row["mean"].endswith(") worse") and row["FQE"].endswith(") worse") for row in rows.values())
-    place = ("adroit-door-human", "mean", "mae")
-    one = analysis.finding(place[0], "scaling", *place[1:], baseline="oat-paper").improvement
-    other = analysis.finding(place[0], "oat-paper", *place[1:], baseline="scaling").improvement
-    assert one.effect == pytest.approx(-other.effect)
-    assert one.standard_error == pytest.approx(other.standard_error)
-    assert help_table(analysis, "adroit-door-human", "mae", baseline="oat") is None  # not measured
-
-
 def test_a_family_that_failed_on_one_side_is_left_out_of_the_mean_of_both() -> None:
     whole = results_of({"adroit-door-human": True})
     kept = tuple(c for c in whole.cells if not (c.variant == "scaling" and c.family == "IS"))
@@ -213,82 +91,6 @@ def test_a_family_that_failed_on_one_side_is_left_out_of_the_mean_of_both() -> N
     assert "FQE only" in told["scaling"] and "only" not in told["jittering"]
     assert "FQE only" in make_page((partial.results,))
     assert found.improvement.before == pytest.approx(100, abs=2)
-
-
-def test_the_papers_numbers_stand_beside_ours(analysis: Analysis) -> None:
-    table = paper_table(analysis, "human", "mae")
-    rows = {(row[0], row[1]): dict(zip(table.header, row, strict=False)) for row in table.rows}
-    assert table.header[2:6] == ("pen", "paper", "door", "paper")
-    by_place = {(row[0], row[1]): row for row in table.rows}
-    oat = by_place["FQE", "OAT (oat-paper)"]
-    assert oat[4].startswith("40 ±") or float(oat[4].split()[0]) == pytest.approx(40, abs=1)
-    assert oat[4].endswith("+")
-    assert oat[5] == "255 ± 17"
-    assert oat[2] == "" and oat[3] == "540 ± 17"  # pen was not measured; the paper has it
-    assert by_place["FQE", "NoAug. (none)"][5] == "389 ± 60"
-    assert rows
-    assert paper_table(analysis, "expert", "mae") is None
-
-
-def test_the_papers_averages_agree_with_its_single_tables() -> None:
-    """Errors and regrets of table 2 are the means of tables 3, 5 and 6; the paper's claims follow from them."""
-    for metric in ("mae", "regret_at_1", "regret_at_5"):
-        for method in paper.METHODS:
-            for task in paper.TASKS:
-                single = [paper.printed("human", metric, each, method, task).mean for each in paper.ESTIMATORS]
-                assert paper.average("human", metric, method, task).mean == pytest.approx(np.mean(single), abs=0.01)
-    claims = {"pen": 71, "door": 36, "hammer": 45, "relocate": 76}
-    for task, percent in claims.items():
-        before, after = (paper.average("human", "mae", method, task).mean for method in ("NoAug.", "OAT"))
-        assert 100 * (before - after) / before == pytest.approx(percent, abs=0.6)
-    with pytest.raises(ConfigurationError, match="no"):
-        paper.printed("human", "mae", "FQE", "magic", "door")
-
-
-def test_all_tables_are_written_and_hold_what_they_say(analysis: Analysis, tmp_path: Path) -> None:
-    tables = all_tables(analysis)
-    names = {table.name for table in tables}
-    assert {"table-02", "table-03", "table-04", "dataset-adroit-door-human"} <= names
-    assert "table-01-adroit-door-human" in names  # one of the policies is called expert
-    helped = next(table for table in tables if table.name == "helped-mae-adroit-door-human")
-    cells = {row[0]: dict(zip(helped.header, row, strict=True)) for row in helped.rows}
-    assert set(cells) == {"oat-paper", "jittering", "scaling"}
-    assert cells["oat-paper"]["FQE"].endswith(") helps") and cells["scaling"]["mean"].endswith(") hurts")
-    assert float(cells["oat-paper"]["FQE"].split()[0]) == pytest.approx(60, abs=2)
-    assert cells["jittering"]["seeds"] == "3" and cells["jittering"]["mean"].endswith(")")
-    for table in tables:
-        assert all(len(row) == len(table.header) for row in table.rows)
-        assert "3 seeds" in table.caption or table.name.startswith("table-01")
-    paths = write_tables(tables, tmp_path)
-    assert (tmp_path / "tables.md") in paths
-    assert "Table 3." in (tmp_path / "tables.md").read_text()
-
-
-def test_the_overview_has_every_dataset_and_counts_verdicts() -> None:
-    whole = results_of({"adroit-door-human": True, "line": True, "logs": False})
-    kept = tuple(
-        part
-        for part in whole.cells
-        if (part.dataset, part.variant) != ("line", "scaling")
-        and (part.dataset, part.variant, part.seed > 0) != ("line", "jittering", True)
-    )
-    table = overview_table(Analysis(Results(whole.setting, kept, whole.manifests, ())), "mae")
-    rows = {row[0]: dict(zip(table.header[1:], row[1:], strict=True)) for row in table.rows}
-    assert table.header == ("variant", "over all", "another task", "helps on", "hurts on", "adroit-door-human", "line")
-    assert rows["scaling"]["over all"] == rows["scaling"]["adroit-door-human"]  # of the one that was measured
-    assert rows["jittering"]["over all"] == rows["jittering"]["adroit-door-human"]  # one seed does not count
-    counts = {name: (row["helps on"], row["hurts on"]) for name, row in rows.items()}
-    expected = {"oat-paper": ("2 of 2", "0 of 2"), "jittering": ("0 of 1", "0 of 1"), "scaling": ("0 of 1", "1 of 1")}
-    assert counts == expected
-    assert rows["oat-paper"]["line"].endswith(") helps") and rows["scaling"]["line"] == "-"
-    assert rows["jittering"]["line"].endswith("(one seed)")
-    assert overview_table(Analysis(results_of({"line": True})), "mae") is None
-    against = overview_table(Analysis(whole), "mae", baseline="oat-paper")
-    assert against.header[3:5] == ("better on", "worse on") and {row[0] for row in against.rows} == {
-        "jittering",
-        "scaling",
-    }
-    assert all(row[1].endswith(") worse") for row in against.rows)
 
 
 def test_datasets_of_one_task_count_as_one() -> None:
@@ -401,8 +203,10 @@ def test_the_page_says_it_all_and_loads_nothing(analysis: Analysis) -> None:
     assert "Nobody knows." in page
     assert "order kept" in page
     assert "&lt;diverged&gt;" in page  # what cells say is text, never markup
-    for word in ("helps", "hurts", "no evidence"):
-        assert word in page
+    verdicts = {"oat-paper": ("good", "helps"), "jittering": ("", "no evidence"), "scaling": ("bad", "hurts")}
+    for name, (style, word) in verdicts.items():  # of the error, the first column
+        row = re.search(rf"<tr><td>{name}</td><td><span class=\"(\w*)\">([\w ]+)</span>", page)
+        assert row and row.group(2) == word and (row.group(1) == style or not style)
 
 
 def test_one_seed_is_said_to_be_no_evidence() -> None:
@@ -443,6 +247,23 @@ def test_pictures_name_what_was_measured_on_some_datasets_only() -> None:
     assert by_level(Analysis(results_of({"adroit-door-human": True}))) is None
 
 
+def test_true_values_and_trajectories_are_drawn_as_they_are() -> None:
+    values, errors = np.array([1.0, 3.0, -2.0]), np.array([0.1, 0.0, math.nan])  # exact values have no error
+    (axes,) = figures.returns_bars(["a", "b", "c"], values, errors, title="x").axes
+    assert [patch.get_width() for patch in axes.patches] == pytest.approx(values)
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["a", "b", "c"]
+    points = np.arange(12.0).reshape(6, 2)
+    episode, made = np.array([0, 0, 0, 4, 4, 4]), np.array([False, True, True, False, False, True])
+    arrays = {"real": points, "real_episode": episode, "real_generated": np.zeros(6, dtype=bool)}
+    arrays |= {"synthetic": points + 1, "synthetic_episode": episode, "synthetic_generated": made}
+    drawn = figures.coverage(arrays, labels=("x", "y"), title="t", walls=np.array([[0.0, 0.0, 1.0, 1.0]]))
+    recorded, augmented = drawn.axes
+    assert "2 trajectories" in recorded.get_title() and len(recorded.patches) == 1
+    coloured = [np.isfinite(line.get_ydata()).sum() for line in augmented.lines[1::2]]
+    assert coloured == [2, 1] and not any(np.isfinite(line.get_ydata()).any() for line in recorded.lines[1::2])
+    np.testing.assert_array_equal(augmented.lines[0].get_xydata(), points[:3] + 1)
+
+
 def test_bars_draw_what_was_measured(analysis: Analysis) -> None:
     names = [name for name in ERRORS if name != "none"]
     changes = [analysis.finding("adroit-door-human", name, "mean", "mae").improvement for name in names]
@@ -454,4 +275,3 @@ def test_bars_draw_what_was_measured(analysis: Analysis) -> None:
     assert figures.to_png(drawn).startswith(b"\x89PNG")
     with pytest.raises(ConfigurationError, match="at least one panel"):
         figures.improvement_bars([], title="x")
-    assert "mae" in METRICS

@@ -72,7 +72,7 @@ def test_estimates_come_near_the_exact_values(finished: tuple[Plan, Path]) -> No
         assert result.knows_truth and not result.failed
         if result.family == "FQE":
             np.testing.assert_allclose(result.values[1:], result.true[1:], atol=1.0)
-        assert result.record["cost"]["cpu_seconds"] >= 0
+        assert result.record["cost"]["wall_seconds"] > 0
         assert result.record["cost"]["peak_memory_mb"] > 10
         assert result.record["environment"]["numpy"] == np.__version__
         assert processor() in result.record["environment"]["machine"]

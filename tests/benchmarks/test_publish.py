@@ -12,7 +12,7 @@ from oat_gym.benchmark.analysis import Analysis
 from oat_gym.benchmark.results import Results
 from oat_gym.benchmark.store import CellResult
 from oat_gym.benchmark.tables import all_tables
-from tests.benchmark.test_report import ERRORS, cell, results_of
+from tests.benchmark.known import ERRORS, cell, results_of
 
 DATASETS = {
     "adroit-door-human": True,
