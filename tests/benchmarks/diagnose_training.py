@@ -1,12 +1,13 @@
 """What moves estimates beside augmentation: gradient steps, noise of a known size, initial states and horizon.
 
-    python tests/benchmarks/diagnose_training.py run --out FOLDER [--dataset adroit-door-human] [--seeds 3]
+    python tests/benchmarks/diagnose_training.py run --out FOLDER [--dataset adroit-door-human] [--seeds 3] [--only ...]
     python tests/benchmarks/diagnose_training.py tables --out FOLDER --to FOLDER
 
 Every row of the table is one change to the standard budget's evaluation of the recorded episodes alone:
 
-- `updates x0.1`, `x0.3`, `x3`: fewer or more gradient steps, batches of the same size. With equal updates a dataset
-  made ten times as large is seen a tenth as often, which is `x0.1` here: equal updates beside equal epochs.
+- `updates x0.1`, `x0.3`, `x3`, `x10`: fewer or more gradient steps, batches of the same size. With equal updates a
+  dataset made ten times as large is seen a tenth as often, as the recorded one is with `x0.1`. With equal epochs it is
+  given ten times the steps, as in `oat updates x10` and `oat-paper updates x10`, beside `updates x10` alone.
 - `copies`: nine exact copies of every episode, used as synthetic ones are: what is left of an augmentation without its
   content. `jitter S`: the same with noise of S standard deviations, for training only: regularisation without
   information.
@@ -80,9 +81,14 @@ def _noise(name: str, sigma: float) -> Variant:
     return Variant(name, Jittering(sigma=sigma), use_augmented=None, note=f"noise of {sigma} standard deviations")
 
 
+_AUGMENTED = (VARIANTS["oat"], VARIANTS["oat-paper"])
 CHANGES = (
-    Change("none", (VARIANTS[NONE], _noise("copies", 0.0), *(_noise(f"jitter {size}", size) for size in JITTERS))),
+    Change(
+        NONE,
+        (VARIANTS[NONE], _noise("copies", 0.0), *(_noise(f"jitter {size}", size) for size in JITTERS), *_AUGMENTED),
+    ),
     *(Change(f"updates x{scale:g}", updates=scale) for scale in SCALES),
+    Change("updates x10", (VARIANTS[NONE], *_AUGMENTED), updates=10.0),
     Change("data starts", question=Question(initial="data")),
     Change("endless", endless=True),
 )
@@ -142,7 +148,7 @@ def _rows(change: str, analysis: Analysis) -> list[tuple[str, ...]]:
                     continue
                 numbers = [_told(analysis.scores(dataset, variant, family, metric)) for metric in METRICS]
                 bias = np.array([float((cell.values - cell.true).mean()) for cell in cells])
-                name = change if variant == NONE else variant
+                name = " ".join(part for part in (variant, change) if part != NONE) or NONE
                 rows.append((dataset, family, name, *numbers, _told(bias), str(len(cells))))
     return rows
 
@@ -183,14 +189,14 @@ def main(arguments: list[str] | None = None) -> None:
     running.add_argument("--dataset", default="adroit-door-human", choices=tuple(domains.DATASETS))
     running.add_argument("--seeds", type=int, default=3)
     running.add_argument("--budget", default="standard", choices=tuple(BUDGETS))
+    running.add_argument("--estimators", default="all", help="all, or some of fqe,is,dice,dr,mb")
     names = [change.name for change in CHANGES]
     running.add_argument("--only", nargs="+", default=names, choices=names, help="some of the changes")
     telling.add_argument("--to", type=Path, required=True, help="folder of the tables")
     options = parser.parse_args(arguments)
     if options.command == "run":
-        run_all(
-            options.out, options.dataset, options.seeds, BUDGETS[options.budget], Catalog.installed(), only=options.only
-        )
+        budget = BUDGETS[options.budget].choose(options.estimators)
+        run_all(options.out, options.dataset, options.seeds, budget, Catalog.installed(), only=options.only)
     else:
         tables(options.out, options.to)
 

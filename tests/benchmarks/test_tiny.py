@@ -60,12 +60,21 @@ def test_the_door_evidence(shared_data: Path, tmp_path: Path) -> None:
 
 def test_the_diagnosis_of_training(tmp_path: Path) -> None:
     script, out = "diagnose_training.py", str(tmp_path / "cells")
-    settings = ("--dataset", "maze2d-umaze", "--seeds", "1", "--budget", "quick")
+    settings = ("--dataset", "maze2d-umaze", "--seeds", "1", "--budget", "quick", "--estimators", "fqe,is")
     run(script, "run", "--out", out, *settings, folder=tmp_path)
     again = run(script, "run", "--out", out, *settings, folder=tmp_path)
     assert {line.split(": ")[1].split(" jobs")[0] for line in again.splitlines()} == {"0"}
     table = run(script, "tables", "--out", out, "--to", str(tmp_path / "tables"), folder=tmp_path)
     rows = [[cell.strip() for cell in line.split("|")[2:4]] for line in table.splitlines() if "maze2d" in line]
-    changes = ("none", "copies", "updates x0.1", "updates x3", "data starts", "endless")
+    changes = (
+        "none",
+        "copies",
+        "updates x0.1",
+        "updates x10",
+        "oat",
+        "oat-paper updates x10",
+        "data starts",
+        "endless",
+    )
     assert {("FQE", change) for change in changes} <= {(family, change) for family, change in rows}
-    assert ("IS", "updates x3") not in {tuple(row) for row in rows}  # it takes no gradient steps
+    assert ("IS", "updates x10") not in {tuple(row) for row in rows}  # it takes no gradient steps
