@@ -23,14 +23,18 @@ DATASETS = {
 PUBLISHED = Path(__file__).parent / "results" / "benchmark"
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("publish", Path(__file__).with_name("publish.py"))
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    return load("publish")
 
 
 def run_of(*cells: CellResult) -> Analysis:
@@ -191,3 +195,12 @@ def test_what_nothing_published_is_of_is_removed(script: ModuleType, tmp_path: P
     there = {path.name for path in tmp_path.iterdir()}
     assert {*others, "bars-maze2d-umaze.png", "dataset-maze2d-umaze.md", "cells.csv"} <= there
     assert there.isdisjoint({"bars-sepsis-sim.png", "dataset-sepsis-sim.md"})
+
+
+def test_what_is_said_of_the_default_is_what_the_published_numbers_say(script: ModuleType) -> None:
+    tell = load("tell_default")
+    text = (PUBLISHED / "default.md").read_text()
+    rows = tell.table(script.Published(script.Numbers.read(PUBLISHED)))
+    assert len(rows.splitlines()) == 2 + 6 * 5
+    assert tell.replaced(text, rows) == text
+    assert tell.replaced(text.replace("| **13 (", "| **99 (", 1), rows) == text

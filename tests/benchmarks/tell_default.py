@@ -1,0 +1,108 @@
+"""Write anew what the published numbers say of the default form of OAT, beside its former form and the paper's.
+
+    python tests/benchmarks/tell_default.py --in tests/benchmarks/results/benchmark
+
+Replaces the rows of the table of errors in FOLDER/default.md, and prints them; nothing is computed anew. Positive
+numbers are less error of the first form named in a row. The table of ranks is of cells that are not published.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from publish import Numbers, Published
+
+from oat_gym.benchmark.analysis import MEAN, Finding
+from oat_gym.benchmark.protocol import SUITES
+from oat_gym.benchmark.variants import NONE
+from oat_gym.cache import write_atomically
+
+FAMILIES = (MEAN, "FQE", "MB", "IS", "DR", "DICE")
+FORMS = ("oat", "oat-prior", "oat-paper")
+COMPARISONS = (
+    ("the default over the former one", "oat-prior", "oat", True),
+    ("the default over the paper's form", "oat-paper", "oat", True),
+    ("the default over none", "oat", NONE, False),
+    ("the former default over none", "oat-prior", NONE, False),
+    ("the paper's form over none", "oat-paper", NONE, False),
+)
+"""Words, variant, baseline, and whether the words name the baseline first: what is published is over `oat`."""
+TITLE = "**Percent less mean absolute error**"
+
+
+def table(published: Published) -> str:
+    """Return the table in markdown."""
+    every = [name for name in published.with_truth() if all(_measured(published, name, form) for form in FORMS)]
+    expert = [name for name in SUITES["adroit-expert"].datasets if name in every]
+    cloned = [name for name in SUITES["adroit-cloned"].datasets if name in every]
+    chosen = [*expert, *cloned, "maze2d-umaze-d4rl"]
+    rest = ["icu-sepsis-features", "sepsis-mdp-features", "maze2d-umaze"]
+    groups = (
+        (f"door-human left out: 4 tasks and maze2d-umaze-d4rl, {len(chosen)} datasets", chosen, False),
+        ("another such task: the interval of how much these 5 differ", chosen, True),
+        (f"of these, Adroit expert, {len(expert)}", expert, False),
+        (f"of these, Adroit cloned, {len(cloned)}", cloned, False),
+        ("ICU-Sepsis, MDP, maze2d-umaze, 3", rest, False),
+        (f"all that have the three forms, {len(every)}", every, False),
+    )
+    lines = ["| datasets | | mean of five | FQE | MB | IS | DR | DICE |", "|---|---|---|---|---|---|---|---|"]
+    for label, datasets, between in groups:
+        for words, variant, baseline, turned in COMPARISONS:
+            cells = [
+                told(
+                    published.over_all(variant, name, "mae", baseline=baseline, datasets=datasets, between=between),
+                    turned=turned,
+                )
+                for name in FAMILIES
+            ]
+            lines.append(f"| {label} | {words} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _measured(published: Published, dataset: str, form: str) -> bool:
+    return published.finding(dataset, form, MEAN, "mae") is not None
+
+
+def told(found: Finding | None, *, turned: bool) -> str:
+    """Return percent less error with its interval, in bold where that excludes zero; turned: of the baseline."""
+    if found is None:
+        return "-"
+    change = found.improvement
+    if not math.isfinite(change.low):
+        return f"{change.value:.0f}"
+    effects = [-math.log1p(-percent / 100) for percent in (change.value, change.low, change.high)]
+    if turned:
+        effects = [-effects[0], -effects[2], -effects[1]]
+    value, low, high = (_whole(-100 * math.expm1(-effect)) for effect in effects)
+    text = f"{value} ({low} to {high})"
+    return f"**{text}**" if effects[1] > 0 or effects[2] < 0 else text
+
+
+def _whole(percent: float) -> str:
+    return f"{round(percent)}"
+
+
+def replaced(text: str, table: str) -> str:
+    """Return the text with the table that follows its title replaced."""
+    before, title, after = text.partition(TITLE)
+    if not title:
+        raise SystemExit(f"There is no {TITLE!r}.")
+    rest = after.lstrip("\n").partition("\n\n")[2]
+    return f"{before}{title}\n\n{table}\n\n{rest}"
+
+
+def main() -> None:
+    """Read the command line and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--in", dest="folder", type=Path, required=True)
+    folder = parser.parse_args().folder
+    rows = table(Published(Numbers.read(folder)))
+    path = folder / "default.md"
+    write_atomically(path, replaced(path.read_text(), rows).encode())
+    print(rows)
+
+
+if __name__ == "__main__":
+    main()
