@@ -14,10 +14,10 @@ Where these are of another configuration than the published ones (other data, st
 torch), everything published of that dataset is left out first. Of the same configuration, a variant that comes out
 otherwise than published, where the cells without augmentation come out as published, is of a method whose code was
 changed, and its rows replace the published ones too. A run that computes published variants anew, the same seeds and
-configurations, adds improvements over a baseline that they were not compared with, and one of more seeds that lacks a
-baseline leaves those over it. Where the true values are not known, a run's cells and estimates replace the
-published ones. Only cells of the budget "standard" from reset starts
-are published. What was taken of each run is printed.
+configurations, adds improvements over a baseline that they were not compared with by so many seeds, and one of more
+seeds that lacks a baseline leaves those over it. Where the true values are not known, a run's cells and estimates
+replace the published ones. Only cells of the budget "standard" from reset starts are published. What was taken of each
+run is printed.
 """
 
 from __future__ import annotations
@@ -120,17 +120,16 @@ def merged(old: Numbers, new: Numbers) -> Numbers:
         and _comparison(row) not in measured
     ]
     standing = [row for row in (*kept(old.improvements), *grown) if (row["dataset"], row["baseline"]) not in changed]
-    compared = {_comparison(row) for row in (*standing, *fresh(new.improvements))}
-    more_pairs = [
-        row
-        for row in new.improvements
-        if _comparison(row) not in compared
-        and {(row["dataset"], row["variant"]), (row["dataset"], row["baseline"])} <= same
-    ]
+    improvements = {_comparison(row): row for row in (*standing, *fresh(new.improvements))}
+    for row in new.improvements:
+        both = {(row["dataset"], row["variant"]), (row["dataset"], row["baseline"])}
+        known = improvements.get(_comparison(row))
+        if both <= same and (known is None or int(row["seeds"]) > int(known["seeds"])):
+            improvements[_comparison(row)] = row
     recorded = {row["dataset"]: row for row in (*old.recorded, *new.recorded)}
     return Numbers(
         cells=(*kept(old.cells), *fresh(new.cells)),
-        improvements=(*standing, *fresh(new.improvements), *more_pairs),
+        improvements=tuple(improvements.values()),
         estimates=(*kept(old.estimates), *fresh(new.estimates)),
         recorded=tuple(recorded.values()),
     )

@@ -89,6 +89,10 @@ def test_a_run_of_published_variants_adds_comparisons_that_were_not_there(script
     more = script.merged(old, script.Numbers.of(only(whole, "oat-paper", "none", "jittering")))
     assert {row["baseline"] for row in improvements(more, "jittering")} == {"none", "oat-paper"}
     assert {str(row) for row in old.improvements} <= {str(row) for row in more.improvements}
+    two = [dict(row) | {"seeds": "2"} for row in more.improvements if row["baseline"] == "oat-paper"]
+    of_two = [row for row in more.improvements if row["baseline"] == "none"] + two
+    again = script.merged(dataclasses.replace(more, improvements=tuple(of_two)), script.Numbers.of(whole))
+    assert {str(row) for row in more.improvements} <= {str(row) for row in again.improvements}  # by three seeds again
     fewer = [part for part in whole.results.cells if part.seed > 0 or part.variant != "oat-paper"]
     two_seeds = Analysis(dataclasses.replace(whole.results, cells=tuple(fewer)))
     assert script.merged(old, script.Numbers.of(only(two_seeds, "oat-paper", "none", "jittering"))) == old
