@@ -201,10 +201,13 @@ def test_what_nothing_published_is_of_is_removed(script: ModuleType, tmp_path: P
     assert there.isdisjoint({"bars-sepsis-sim.png", "dataset-sepsis-sim.md"})
 
 
-def test_what_is_said_of_the_default_is_what_the_published_numbers_say(script: ModuleType) -> None:
-    tell = load("tell_default")
-    text = (PUBLISHED / "default.md").read_text()
-    rows = tell.table(script.Published(script.Numbers.read(PUBLISHED)))
-    assert len(rows.splitlines()) == 2 + 6 * 5
+@pytest.mark.parametrize(("name", "table"), [("README.md", "by_dataset"), ("default.md", "of_the_default")])
+def test_the_tables_that_are_read_first_are_what_the_published_numbers_say(
+    script: ModuleType, name: str, table: str
+) -> None:
+    tell, text = load("tell"), (PUBLISHED / name).read_text()
+    rows = getattr(tell, table)(script.Published(script.Numbers.read(PUBLISHED)))
+    assert len(rows.splitlines()) >= 2 + 16
     assert tell.replaced(text, rows) == text
-    assert tell.replaced(text.replace("| **13 (", "| **99 (", 1), rows) == text
+    first = rows.splitlines()[2]
+    assert tell.replaced(text.replace(first, first.replace("(", "(9", 1)), rows) == text

@@ -1,9 +1,10 @@
-"""Write anew what the published numbers say of the default form of OAT, beside its former form and the paper's.
+"""Write the two tables that are read first anew from the published numbers; nothing is computed.
 
-    python tests/benchmarks/tell_default.py --in tests/benchmarks/results/benchmark
+    python tests/benchmarks/tell.py --in tests/benchmarks/results/benchmark
 
-Replaces the rows of the table of errors in FOLDER/default.md, and prints them; nothing is computed anew. Positive
-numbers are less error of the first form named in a row. The table of ranks is of cells that are not published.
+In FOLDER/README.md: the improvement of the mean error on every dataset, and which other variants help and hurt. In
+FOLDER/default.md: percent less error of the default form of OAT than of its former form, the paper's and none; its
+table of ranks is of cells that are not published.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from oat_gym.benchmark.protocol import SUITES
 from oat_gym.benchmark.variants import NONE
 from oat_gym.cache import write_atomically
 
+COLUMNS = ("oat-paper", "oat-prior", "oat", "jittering", "scaling")
+"""The variants of the README's table that have a column of their own."""
 FAMILIES = (MEAN, "FQE", "MB", "IS", "DR", "DICE")
 FORMS = ("oat", "oat-prior", "oat-paper")
 COMPARISONS = (
@@ -29,11 +32,26 @@ COMPARISONS = (
     ("the paper's form over none", "oat-paper", NONE, False),
 )
 """Words, variant, baseline, and whether the words name the baseline first: what is published is over `oat`."""
-TITLE = "**Percent less mean absolute error**"
 
 
-def table(published: Published) -> str:
-    """Return the table in markdown."""
+def by_dataset(published: Published) -> str:
+    """Return the README's table: a row for each dataset whose true values are known."""
+    ends = ("others that help", "others that hurt")
+    lines = [f"| dataset | {' | '.join((*COLUMNS, *ends))} |", "|---" * (1 + len(COLUMNS) + len(ends)) + "|"]
+    for dataset in published.with_truth():
+        found = {name: published.finding(dataset, name, MEAN, "mae") for name in published.results.variants}
+        verdicts = {name: each.improvement.verdict for name, each in found.items() if each is not None}
+        others = [
+            ", ".join(name for name, verdict in verdicts.items() if verdict == word and name not in COLUMNS) or "-"
+            for word in ("helps", "hurts")
+        ]
+        cells = [told(found.get(name), turned=False) for name in COLUMNS]
+        lines.append(f"| {' | '.join((dataset, *cells, *others))} |")
+    return "\n".join(lines)
+
+
+def of_the_default(published: Published) -> str:
+    """Return the table of errors of `default.md`."""
     every = [name for name in published.with_truth() if all(_measured(published, name, form) for form in FORMS)]
     expert = [name for name in SUITES["adroit-expert"].datasets if name in every]
     cloned = [name for name in SUITES["adroit-cloned"].datasets if name in every]
@@ -81,16 +99,18 @@ def told(found: Finding | None, *, turned: bool) -> str:
 
 
 def _whole(percent: float) -> str:
-    return f"{round(percent)}"
+    """Return a percentage without digits; with one where it would be told as 0 and is not."""
+    return f"{percent:.0f}" if abs(percent) >= 0.5 else "0" if abs(percent) < 0.05 else f"{percent:.1f}"
 
 
 def replaced(text: str, table: str) -> str:
-    """Return the text with the table that follows its title replaced."""
-    before, title, after = text.partition(TITLE)
-    if not title:
-        raise SystemExit(f"There is no {TITLE!r}.")
-    rest = after.lstrip("\n").partition("\n\n")[2]
-    return f"{before}{title}\n\n{table}\n\n{rest}"
+    """Return the text with the first table that has the same heading replaced."""
+    head = table.partition("\n")[0]
+    before, found, after = text.partition(f"{head}\n")
+    if not found:
+        raise SystemExit(f"There is no table {head!r}.")
+    _, gap, rest = after.partition("\n\n")
+    return f"{before}{table}{gap}{rest}"
 
 
 def main() -> None:
@@ -98,10 +118,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--in", dest="folder", type=Path, required=True)
     folder = parser.parse_args().folder
-    rows = table(Published(Numbers.read(folder)))
-    path = folder / "default.md"
-    write_atomically(path, replaced(path.read_text(), rows).encode())
-    print(rows)
+    published = Published(Numbers.read(folder))
+    for name, table in (("README.md", by_dataset(published)), ("default.md", of_the_default(published))):
+        path = folder / name
+        write_atomically(path, replaced(path.read_text(), table).encode())
 
 
 if __name__ == "__main__":
