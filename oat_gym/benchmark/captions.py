@@ -15,7 +15,7 @@ USES = (
 
 
 def notes(analysis: Analysis, datasets: Mapping[str, str | None], *, signs: bool = True) -> str:
-    """Return what a caption must say: seeds, setting, budget, missing data, stand-ins, and what means and `SIGNS` are."""
+    """Return what a caption must say: seeds, setting, budget, gaps, stand-ins, and what means and `SIGNS` are."""
     there = [name for name in datasets.values() if name is not None]
     told, fewer = seed_numbers(analysis, there)
     text = f"{told}{', mean ± standard deviation' if signs else ''}; "
