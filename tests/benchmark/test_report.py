@@ -31,11 +31,6 @@ from oat_gym.errors import CacheError, ConfigurationError
 from tests.benchmark.known import ERRORS, TRUE, cell, results_of
 
 
-@pytest.fixture(scope="module")
-def analysis() -> Analysis:
-    return Analysis(results_of({"adroit-door-human": True, "logs": False}))
-
-
 def test_verdicts_follow_the_errors(analysis: Analysis) -> None:
     verdicts = {name: analysis.finding("adroit-door-human", name, "mean", "mae") for name in ERRORS if name != "none"}
     assert {name: found.improvement.verdict for name, found in verdicts.items()} == {

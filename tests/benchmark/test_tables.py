@@ -25,11 +25,6 @@ from oat_gym.errors import ConfigurationError
 from tests.benchmark.known import ERRORS, POLICIES, cell, results_of
 
 
-@pytest.fixture(scope="module")
-def analysis() -> Analysis:
-    return Analysis(results_of({"adroit-door-human": True, "logs": False}))
-
-
 def test_estimates_are_told_where_nobody_knows_the_truth(analysis: Analysis) -> None:
     table = estimates_table(analysis, "logs")
     assert table is not None

@@ -171,7 +171,7 @@ def _caption(results: Results) -> str:
     return (
         f"What moves estimates beside augmentation: mean ± standard deviation over seeds "
         f"{sorted({cell.seed for cell in cells})}. {results.manifests[-1]['budget_line']}. "
-        f"{cost:.0f} CPU s for the unchanged, copied and jittered rows; commit {commits}; {versions}; {here['device']}."
+        f"{cost:.0f} CPU s for the rows of the usual steps; commit {commits}; {versions}; {here['device']}."
     )
 
 

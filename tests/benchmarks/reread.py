@@ -18,8 +18,15 @@ def told(found: Finding | None, *, digits: int = 0) -> str:
     if found is None or found.improvement.n_seeds < 2:
         return "-"
     change = found.improvement
-    text = f"{change.value:.{digits}f} ({change.low:.{digits}f} to {change.high:.{digits}f})"
-    return f"**{text}**" if change.verdict in ("helps", "hurts") else text
+    value, low, high = (_number(number, digits) for number in (change.value, change.low, change.high))
+    return f"**{value} ({low} to {high})**" if change.verdict in ("helps", "hurts") else f"{value} ({low} to {high})"
+
+
+def _number(value: float, digits: int) -> str:
+    """Return a number in so many digits, one more where it would be told as 0 and is not."""
+    if not round(value, digits):
+        return f"{value:.{digits + 1}f}" if round(value, digits + 1) else "0"
+    return f"{value:.{digits}f}"
 
 
 def write(out: Path, rows: Sequence[Row], *, name: str, caption: str) -> None:

@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import replace
 from pathlib import Path
 
 from publish import Numbers, Published
+from reread import told
 
 from oat_gym.benchmark.analysis import MEAN, Finding
 from oat_gym.benchmark.protocol import SUITES
@@ -45,7 +47,7 @@ def by_dataset(published: Published) -> str:
             ", ".join(name for name, verdict in verdicts.items() if verdict == word and name not in COLUMNS) or "-"
             for word in ("helps", "hurts")
         ]
-        cells = [told(found.get(name), turned=False) for name in COLUMNS]
+        cells = [told(found.get(name)) for name in COLUMNS]
         lines.append(f"| {' | '.join((dataset, *cells, *others))} |")
     return "\n".join(lines)
 
@@ -67,14 +69,12 @@ def of_the_default(published: Published) -> str:
     )
     lines = ["| datasets | | mean of five | FQE | MB | IS | DR | DICE |", "|---|---|---|---|---|---|---|---|"]
     for label, datasets, between in groups:
-        for words, variant, baseline, turned in COMPARISONS:
-            cells = [
-                told(
-                    published.over_all(variant, name, "mae", baseline=baseline, datasets=datasets, between=between),
-                    turned=turned,
-                )
+        for words, variant, baseline, backwards in COMPARISONS:
+            found = [
+                published.over_all(variant, name, "mae", baseline=baseline, datasets=datasets, between=between)
                 for name in FAMILIES
             ]
+            cells = [told(turned(each) if backwards else each) for each in found]
             lines.append(f"| {label} | {words} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -83,24 +83,13 @@ def _measured(published: Published, dataset: str, form: str) -> bool:
     return published.finding(dataset, form, MEAN, "mae") is not None
 
 
-def told(found: Finding | None, *, turned: bool) -> str:
-    """Return percent less error with its interval, in bold where that excludes zero; turned: of the baseline."""
+def turned(found: Finding | None) -> Finding | None:
+    """Return the improvement of the baseline over the variant, in percent of the variant's error."""
     if found is None:
-        return "-"
+        return None
     change = found.improvement
-    if not math.isfinite(change.low):
-        return f"{change.value:.0f}"
-    effects = [-math.log1p(-percent / 100) for percent in (change.value, change.low, change.high)]
-    if turned:
-        effects = [-effects[0], -effects[2], -effects[1]]
-    value, low, high = (_whole(-100 * math.expm1(-effect)) for effect in effects)
-    text = f"{value} ({low} to {high})"
-    return f"**{text}**" if effects[1] > 0 or effects[2] < 0 else text
-
-
-def _whole(percent: float) -> str:
-    """Return a percentage without digits; with one where it would be told as 0 and is not."""
-    return f"{percent:.0f}" if abs(percent) >= 0.5 else "0" if abs(percent) < 0.05 else f"{percent:.1f}"
+    value, high, low = (-100 * math.expm1(-math.log1p(-each / 100)) for each in (change.value, change.low, change.high))
+    return replace(found, improvement=replace(change, value=value, low=low, high=high))
 
 
 def replaced(text: str, table: str) -> str:

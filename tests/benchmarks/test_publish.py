@@ -205,6 +205,7 @@ def test_what_nothing_published_is_of_is_removed(script: ModuleType, tmp_path: P
 def test_the_tables_that_are_read_first_are_what_the_published_numbers_say(
     script: ModuleType, name: str, table: str
 ) -> None:
+    load("reread")
     tell, text = load("tell"), (PUBLISHED / name).read_text()
     rows = getattr(tell, table)(script.Published(script.Numbers.read(PUBLISHED)))
     assert len(rows.splitlines()) >= 2 + 16
